@@ -1,0 +1,1 @@
+"""Rods, slice planes, poses: pure arrays; knows no image and no file."""

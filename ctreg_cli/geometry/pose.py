@@ -1,0 +1,96 @@
+"""Poses: 4 × 4 matrices, twists ``[V; Ω]`` and quaternions, with every convention in one place.
+
+``T_slice_model`` maps model to slice coordinates, ``P_slice = R P_model + t`` (mm). A twist is translation first,
+``Ṗ = V + Ω × (P − t)``: V moves the model origin, Ω turns about it, both in slice axes. Hence the update is
+``R ← exp([Ω]ₓ) R``, ``t ← t + V`` — *not* the exponential of SE(3), whose translation turns as it goes. SciPy's own
+se(3) exponential is rotation first; nothing else in ctreg reorders a twist, and nothing else needs to.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry.plucker import skew
+
+
+def make_pose(R: FloatArray, t: FloatArray) -> FloatArray:
+    """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3) in mm."""
+    R = np.asarray(R, dtype=np.float64)
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T: FloatArray) -> FloatArray:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make_pose(R_inverse, -np.einsum("...ij,...j->...i", R_inverse, T[..., :3, 3]))
+
+
+def exp_rotation(omega_rad: FloatArray) -> FloatArray:
+    """Rotations ``exp([Ω]ₓ)`` (..., 3, 3) of rotation vectors (..., 3); Rodrigues' formula, exact near zero too."""
+    omega = np.asarray(omega_rad, dtype=np.float64)
+    angle2 = np.einsum("...i,...i->...", omega, omega)[..., None, None]
+    angle = np.sqrt(angle2)
+    # sinc form: no division by a small angle, no branch
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    K = skew(omega)
+    rotation: FloatArray = np.eye(3) + a * K + b * (K @ K)
+    return rotation
+
+
+def update(T: FloatArray, twist: FloatArray) -> FloatArray:
+    """Pose after the twist ``[V; Ω]`` (..., 6), mm and rad: ``R ← exp([Ω]ₓ) R``, ``t ← t + V`` (eq. 16 integrated)."""
+    twist = np.asarray(twist, dtype=np.float64)
+    return make_pose(exp_rotation(twist[..., 3:]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., :3])
+
+
+def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:
+    """The twist (6,) with ``update(T_from, twist) == T_to``; mm and rad."""
+    omega = Rotation.from_matrix(T_to[:3, :3] @ T_from[:3, :3].T).as_rotvec()
+    return np.concatenate([T_to[:3, 3] - T_from[:3, 3], omega])
+
+
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """The rotations nearest (Frobenius) to matrices (..., 3, 3), with det = +1: a mirror never comes out."""
+    U, _, Vt = np.linalg.svd(M)
+    sign = np.sign(np.linalg.det(U @ Vt))
+    U = U.copy()
+    U[..., :, 2] *= sign[..., None]
+    rotation: FloatArray = U @ Vt
+    return rotation
+
+
+def rotation_angle(R: FloatArray) -> FloatArray:
+    """Angles (...,) in rad of rotations (..., 3, 3), accurate near 0 and near π."""
+    twice_sine = np.linalg.norm(
+        np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1),
+        axis=-1,
+    )
+    angle: FloatArray = np.arctan2(twice_sine, np.trace(R, axis1=-2, axis2=-1) - 1)
+    return angle
+
+
+def quaternion(T: FloatArray) -> FloatArray:
+    """Quaternion ``qx qy qz qw`` (scalar last, ``qw ≥ 0``) of a pose."""
+    q: FloatArray = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return q
+
+
+def from_quaternion(q: FloatArray, t_mm: FloatArray) -> FloatArray:
+    """Pose (4, 4) of a quaternion ``qx qy qz qw`` (any norm but zero) and a translation in mm."""
+    return make_pose(Rotation.from_quat(q).as_matrix(), np.asarray(t_mm, dtype=np.float64))
+
+
+def is_pose(T: FloatArray, tolerance: float = 1e-6) -> bool:
+    """Whether (4, 4) ``T`` is finite and rigid: orthonormal, right-handed, last row 0 0 0 1."""
+    return bool(
+        T.shape == (4, 4)
+        and np.isfinite(T).all()
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=tolerance)
+        and np.linalg.det(T[:3, :3]) > 0
+        and np.allclose(T[3], [0, 0, 0, 1], atol=tolerance)
+    )

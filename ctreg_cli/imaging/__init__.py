@@ -1,0 +1,1 @@
+"""Slices and the spots in them; knows no rod."""

@@ -1,0 +1,69 @@
+"""Spots: where rods (and other bright things) cross a slice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ctreg_cli.arrays import FloatArray, frozen
+
+#: standard deviation (px, each coordinate) given to spots that come without one
+DEFAULT_SPOT_SD_PX = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RejectedSpot:
+    """A candidate the segmentation looked at and left out, with the reason in one short word_with_underscores."""
+
+    u_px: float
+    v_px: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spots:
+    """``m`` spots of one slice, in pixel coordinates ``(u, v)`` = (column, row), zero-based, centres on integers.
+
+    Arrays are read-only float64. Unknown values are NaN. ``covariance_px`` is that of the centre, not the shape.
+    """
+
+    #: (m, 2) centres, px
+    uv_px: FloatArray
+    #: (m, 2, 2) covariance of the centres, px²
+    covariance_px: FloatArray
+    #: (m,) area above half height, px
+    area_px: FloatArray = field(default_factory=lambda: np.empty(0))
+    #: (m,) peak above the local background, in the image's units (HU)
+    contrast: FloatArray = field(default_factory=lambda: np.empty(0))
+    #: (m,) full length (FWHM-like, px) along the long and the short axis, and the long axis' angle from +u towards +v (rad)
+    major_px: FloatArray = field(default_factory=lambda: np.empty(0))
+    minor_px: FloatArray = field(default_factory=lambda: np.empty(0))
+    angle_rad: FloatArray = field(default_factory=lambda: np.empty(0))
+    #: True where the sd was not measured but assumed (``DEFAULT_SPOT_SD_PX`` or ``--spot-sd``)
+    sd_assumed: bool = False
+    rejected: tuple[RejectedSpot, ...] = ()
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "uv_px", frozen(self.uv_px, (None, 2)))
+        m = len(self.uv_px)
+        set_(self, "covariance_px", frozen(self.covariance_px, (m, 2, 2)))
+        for name in ("area_px", "contrast", "major_px", "minor_px", "angle_rad"):
+            values = getattr(self, name)
+            set_(self, name, frozen(values if len(values) else np.full(m, np.nan), (m,)))
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    @classmethod
+    def from_points(cls, uv_px: FloatArray, sd_px: float = DEFAULT_SPOT_SD_PX) -> Spots:
+        """Spots known only by their centres (m, 2), all with the same assumed standard deviation (px)."""
+        uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
+        return cls(uv_px=uv, covariance_px=np.tile(np.eye(2) * sd_px**2, (len(uv), 1, 1)), sd_assumed=True)
+
+    @property
+    def sd_px(self) -> FloatArray:
+        """(m, 2) standard deviations of u and v."""
+        sd: FloatArray = np.sqrt(np.diagonal(self.covariance_px, axis1=1, axis2=2))
+        return sd

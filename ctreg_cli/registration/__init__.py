@@ -1,0 +1,1 @@
+"""Spots and rods in, pose and its covariance out."""
