@@ -1,0 +1,288 @@
+"""Results as files: the pose table and the pose document (one schema for ``pose``, ``track`` and simulated truth)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ctreg_cli._version import __version__
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.errors import InputError
+from ctreg_cli.geometry.pose import from_quaternion, quaternion
+from ctreg_cli.io.sinks import Encoding, open_sinks, rounded
+from ctreg_cli.pipeline import FrameResult
+from ctreg_cli.registration.result import Candidate
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+
+SCHEMA = "ctreg/poses/1"
+
+#: columns of the pose table in order, with the significant digits of a number (None: as it is). 9 digits are under
+#: 1e-6 mm in a scanner's bore; a quaternion of 15 digits gives its rotation back to rounding error.
+COLUMNS: Mapping[str, int | None] = {
+    "slice": None,
+    "source": None,
+    "time_s": None,
+    "status": None,
+    "reason": None,
+    "method": None,
+    "n_spots": None,
+    "n_matched": None,
+    "rms_px": 6,
+    "tx_mm": 9,
+    "ty_mm": 9,
+    "tz_mm": 9,
+    "qx": 15,
+    "qy": 15,
+    "qz": 15,
+    "qw": 15,
+    "sd_tx_mm": 6,
+    "sd_ty_mm": 6,
+    "sd_tz_mm": 6,
+    "sd_rx_deg": 6,
+    "sd_ry_deg": 6,
+    "sd_rz_deg": 6,
+    "iterations": None,
+    # beyond the columns other programs may rely on
+    "s_x_mm": None,
+    "s_y_mm": None,
+    "log_odds": 6,
+    "inflation": 6,
+    "stability": 6,
+    "warnings": None,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResultsHeader:
+    """What the results rest on: the head of the JSON document."""
+
+    model: RodModel
+    #: the scale used for every slice; None: each slice's own
+    scale: Scale | None = None
+    #: where the scale is from: ``dicom``, ``spots``, ``calibration`` or ``option``
+    scale_from: str = "dicom"
+    #: options as resolved, defaults included
+    options: Mapping[str, object] = field(default_factory=dict)
+
+
+def results_encoding(header: ResultsHeader, *, with_uids: bool = False) -> Encoding[FrameResult]:
+    """How a :class:`FrameResult` becomes a row of the pose table and a record of the pose document."""
+
+    def row(result: FrameResult) -> list[Sequence[object]]:
+        fields = _fields(result, header)
+        return [[fields.get(name) for name in COLUMNS]]
+
+    def record(result: FrameResult) -> dict[str, object]:
+        fields = _fields(result, header)
+        uids: dict[str, object] = {"uids": dict(result.info.uids)} if with_uids else {}
+        warnings = [{"code": code, "text": text} for code, text in result.warnings]
+        return {name: fields.get(name) for name in COLUMNS} | uids | _evidence(result, header) | {"warnings": warnings}
+
+    def head(first: FrameResult | None) -> dict[str, object]:
+        scale = header.scale or (first.info.scale if first else None)
+        return {
+            "schema": SCHEMA,
+            "ctreg": __version__,
+            "model": {"name": header.model.name, "sha256": header.model.sha256},
+            "scale": {
+                "s_x_mm": scale.s_x if scale else None,
+                "s_y_mm": scale.s_y if scale else None,
+                "from": header.scale_from,
+            },
+            "options": header.options,
+        }
+
+    return Encoding(columns=list(COLUMNS), rows=row, record=record, header=head, records_key="results")
+
+
+def write_results(
+    results: Iterable[FrameResult], path: str | Path, header: ResultsHeader, *, with_uids: bool = False
+) -> None:
+    """Write results to one file whose suffix (``.csv``, ``.json``, ``.jsonl``) chooses the format.
+
+    Raises:
+        InputError: another suffix, or a place that cannot be written.
+    """
+    with open_sinks([str(path)], results_encoding(header, with_uids=with_uids), io.StringIO()) as sinks:
+        for result in results:
+            sinks.write(result)
+
+
+def accepted(result: FrameResult) -> tuple[Candidate, ...]:
+    """The poses a reader may see: none with ``no_pose``, whatever was tried on the way."""
+    return () if result.status == "no_pose" else result.candidates
+
+
+def _fields(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
+    """Values by column name; what is absent is empty."""
+    info = result.info
+    scale = header.scale or info.scale
+    fields: dict[str, object] = {
+        "slice": result.index,
+        "source": info.source,
+        "time_s": info.time_s,
+        "status": result.status,
+        "reason": result.reason,
+        "method": result.method,
+        "n_spots": len(result.spots),
+        "n_matched": 0,
+        "s_x_mm": scale.s_x if scale else None,
+        "s_y_mm": scale.s_y if scale else None,
+        "stability": result.stability,
+        "warnings": ";".join(code for code, _ in result.warnings),
+    }
+    for candidate in accepted(result)[:1]:
+        fields |= _pose_fields(candidate)
+    return {name: _rounded(value, COLUMNS[name]) for name, value in fields.items()}
+
+
+def _rounded(value: object, digits: int | None) -> object:
+    if not isinstance(value, float) or digits is None or not math.isfinite(value):
+        return value
+    return rounded(value, digits)
+
+
+def _pose_fields(candidate: Candidate) -> dict[str, object]:
+    T = candidate.T_slice_model
+    sd = np.sqrt(np.diagonal(candidate.covariance)).tolist()
+    translation, rotation = T[:3, 3].tolist(), quaternion(T).tolist()
+    return {
+        "n_matched": len(candidate.rod_index),
+        "rms_px": float(candidate.rms_px),
+        **dict(zip(("tx_mm", "ty_mm", "tz_mm"), translation, strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), rotation, strict=True)),
+        **dict(zip(("sd_tx_mm", "sd_ty_mm", "sd_tz_mm"), sd[:3], strict=True)),
+        **dict(zip(("sd_rx_deg", "sd_ry_deg", "sd_rz_deg"), map(math.degrees, sd[3:]), strict=True)),
+        "iterations": int(candidate.iterations),
+        "log_odds": float(candidate.log_odds),
+        "inflation": float(candidate.inflation),
+    }
+
+
+def _evidence(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
+    """What the document has beyond the table: matrices, matches, alternatives, targets."""
+    candidates = accepted(result)
+    best = candidates[0] if candidates else None
+    matched = set(best.spot_index.tolist()) if best else set()
+    ids = header.model.ids
+    return {
+        "T_slice_model": best.T_slice_model if best else None,
+        "T_patient_model": _in_patient(result, best.T_slice_model) if best else None,
+        "covariance": best.covariance if best else None,
+        "matches": _matches(best, result, header) if best else [],
+        "unmatched_spots": [spot for spot in range(len(result.spots)) if spot not in matched],
+        "missing_rods": [ids[rod] for rod in best.missing_rods] if best else [],
+        "candidates": [_alternative(candidate, result, header) for candidate in candidates],
+        "targets": [
+            {
+                "id": target.id,
+                "position_slice": target.position_slice,
+                "position_patient": target.position_patient,
+                "tre_mm": target.tre_mm,
+            }
+            for target in result.targets
+        ],
+    }
+
+
+def _in_patient(result: FrameResult, T_slice_model: FloatArray) -> FloatArray | None:
+    T_patient_slice = result.info.T_patient_slice
+    return None if T_patient_slice is None else T_patient_slice @ T_slice_model
+
+
+def _matches(candidate: Candidate, result: FrameResult, header: ResultsHeader) -> list[dict[str, object]]:
+    uv = result.spots.uv_px
+    return [
+        {
+            "rod": header.model.ids[rod],
+            "spot": int(spot),
+            "u_px": float(uv[spot, 0]),
+            "v_px": float(uv[spot, 1]),
+            "residual_u_px": float(residual[0]),
+            "residual_v_px": float(residual[1]),
+            "lambda_mm": float(lambda_mm),
+        }
+        for rod, spot, residual, lambda_mm in zip(
+            candidate.rod_index, candidate.spot_index, candidate.residual_px, candidate.lambda_mm, strict=True
+        )
+    ]
+
+
+def _alternative(candidate: Candidate, result: FrameResult, header: ResultsHeader) -> dict[str, object]:
+    return {
+        "T_slice_model": candidate.T_slice_model,
+        "T_patient_model": _in_patient(result, candidate.T_slice_model),
+        "covariance": candidate.covariance,
+        "rms_px": float(candidate.rms_px),
+        "chi2": float(candidate.chi2),
+        "degrees_of_freedom": int(candidate.degrees_of_freedom),
+        "log_odds": float(candidate.log_odds),
+        "matches": [
+            {"rod": header.model.ids[rod], "spot": int(spot)}
+            for rod, spot in zip(candidate.rod_index, candidate.spot_index, strict=True)
+        ],
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseRow:
+    """One row of a pose table read back."""
+
+    index: int
+    source: str
+    time_s: float | None
+    status: str
+    reason: str
+    #: (4, 4) model → slice, mm; None where the row holds no pose
+    T_slice_model: FloatArray | None
+    #: every cell as written
+    cells: Mapping[str, str]
+
+
+def read_results(path: str | Path) -> list[PoseRow]:
+    """Rows of a pose table (CSV) as written by :func:`write_results`.
+
+    Raises:
+        InputError: not such a table; the message names file, line and column.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a pose table") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    needed = ("slice", "status", "tx_mm", "ty_mm", "tz_mm", "qx", "qy", "qz", "qw")
+    absent = [name for name in needed if name not in (reader.fieldnames or ())]
+    if absent:
+        raise InputError(f"{path}: no column {', '.join(absent)}; a pose table is what ctreg pose or track writes")
+    return [_pose_row(row, f"{path}:{reader.line_num}") for row in reader]
+
+
+def _pose_row(row: Mapping[str, str], place: str) -> PoseRow:
+    def numbers(*names: str) -> list[float]:
+        try:
+            return [float(row[name]) for name in names]
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{place}: {', '.join(names)}: a number is missing or is none") from error
+
+    cells = {key: value or "" for key, value in row.items() if key}
+    has_pose = bool(cells["qw"])
+    return PoseRow(
+        index=int(numbers("slice")[0]),
+        source=cells.get("source", ""),
+        time_s=numbers("time_s")[0] if cells.get("time_s") else None,
+        status=cells["status"],
+        reason=cells.get("reason", ""),
+        T_slice_model=from_quaternion(
+            np.array(numbers("qx", "qy", "qz", "qw")), np.array(numbers("tx_mm", "ty_mm", "tz_mm"))
+        )
+        if has_pose
+        else None,
+        cells=cells,
+    )

@@ -1,0 +1,299 @@
+"""Where a stream of results goes: CSV, JSON and JSON Lines files, and CSV on standard output, several at once.
+
+What is written is an :class:`Encoding`'s business, how it reaches the disk a sink's.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Generic, Protocol, Self, TextIO, TypeVar
+
+import numpy as np
+
+from ctreg_cli.errors import InputError
+from ctreg_cli.io.atomic import AtomicFile
+
+Item = TypeVar("Item", contravariant=True)
+
+#: suffix → what it means, for help texts and errors
+FORMATS: Mapping[str, str] = {".csv": "table", ".json": "one document", ".jsonl": "one line a slice, as it is done"}
+STANDARD_OUTPUT = "-"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Encoding(Generic[Item]):
+    """How one item (a slice's result, a slice's spots) becomes rows and records."""
+
+    columns: Sequence[str]
+    #: values in the order of ``columns``; None becomes an empty cell
+    rows: Callable[[Item], Iterable[Sequence[object]]]
+    #: JSON object of one item
+    record: Callable[[Item], Mapping[str, object]]
+    #: head of a JSON document; gets the first item, or None when there was none
+    header: Callable[[Item | None], Mapping[str, object]]
+    #: key of the list of records in a JSON document
+    records_key: str
+
+
+class Sink(Protocol[Item]):
+    """One output."""
+
+    def write(self, item: Item) -> None: ...
+    def finish(self) -> None: ...
+    def abandon(self) -> None: ...
+
+
+def plain(value: Any) -> Any:
+    """The value as strict JSON has it: arrays as lists, a number that is not finite as null."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def rounded(value: float, digits: int) -> float:
+    """The nearest number of that many significant digits: no noise in a file, and the same in CSV and JSON."""
+    return float(f"{value:.{digits}g}")
+
+
+def cell(value: object) -> str:
+    """Text of a CSV cell: shortest form that reads back the same, empty for None and NaN."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    if isinstance(value, float):
+        text = repr(float(value))
+        return text.removesuffix(".0")
+    return str(value)
+
+
+def _json(value: object) -> str:
+    return json.dumps(plain(value), allow_nan=False, ensure_ascii=False)
+
+
+class CsvStream(Generic[Item]):
+    """CSV on an open stream, flushed after every item: the next program in a pipe sees a slice once it is done."""
+
+    def __init__(self, stream: TextIO, encoding: Encoding[Item]) -> None:
+        self._stream, self._encoding = stream, encoding
+        self._writer = csv.writer(stream, lineterminator="\n")
+        self._started = False
+
+    def _start(self) -> None:
+        if not self._started:
+            self._writer.writerow(self._encoding.columns)
+            self._started = True
+
+    def write(self, item: Item) -> None:
+        self._start()
+        self._writer.writerows([cell(value) for value in row] for row in self._encoding.rows(item))
+        self._stream.flush()
+
+    def finish(self) -> None:
+        self._start()
+        self._stream.flush()
+
+    def abandon(self) -> None:
+        """What has left cannot be called back."""
+
+
+class CsvFile(CsvStream[Item]):
+    """A table that appears when complete."""
+
+    def __init__(self, path: Path, encoding: Encoding[Item]) -> None:
+        self._file = AtomicFile(path)
+        super().__init__(self._file.stream, encoding)
+
+    def finish(self) -> None:
+        super().finish()
+        self._file.commit()
+
+    def abandon(self) -> None:
+        self._file.abandon()
+
+
+class JsonFile(Generic[Item]):
+    """A document that appears when complete; one record a line, so that memory stays flat and diffs are readable."""
+
+    def __init__(self, path: Path, encoding: Encoding[Item]) -> None:
+        self._file, self._encoding = AtomicFile(path), encoding
+        self._separator = ""
+
+    def _start(self, item: Item | None) -> None:
+        head = _json(self._encoding.header(item)).removesuffix("}")
+        self._file.stream.write(f"{head}, {_json(self._encoding.records_key)}: [\n")
+
+    def write(self, item: Item) -> None:
+        if not self._separator:
+            self._start(item)
+        self._file.stream.write(self._separator + _json(self._encoding.record(item)))
+        self._separator = ",\n"
+
+    def finish(self) -> None:
+        if not self._separator:
+            self._start(None)
+        self._file.stream.write("\n]}\n")
+        self._file.commit()
+
+    def abandon(self) -> None:
+        self._file.abandon()
+
+
+class JsonLinesFile(Generic[Item]):
+    """Header on the first line, then a record a line, each flushed: the one file another program may watch grow."""
+
+    def __init__(self, path: Path, encoding: Encoding[Item]) -> None:
+        self._encoding = encoding
+        if not path.resolve().parent.is_dir():
+            raise InputError(f"{path}: folder {path.parent} does not exist; make it first")
+        try:
+            self._stream = path.open("w", encoding="utf-8", newline="")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+        self._started = False
+
+    def _line(self, value: object) -> None:
+        self._stream.write(_json(value) + "\n")
+        self._stream.flush()
+
+    def _start(self, item: Item | None) -> None:
+        if not self._started:
+            self._line(self._encoding.header(item))
+            self._started = True
+
+    def write(self, item: Item) -> None:
+        self._start(item)
+        self._line(self._encoding.record(item))
+
+    def finish(self) -> None:
+        self._start(None)
+        self._stream.close()
+
+    def abandon(self) -> None:
+        """The lines written are whole and stay."""
+        self._stream.close()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back while a record is written, so that an interrupted file still holds whole records only."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    pending = False
+
+    def note(_number: int, _frame: FrameType | None) -> None:
+        nonlocal pending
+        pending = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if pending:
+        raise KeyboardInterrupt
+
+
+class Sinks(Generic[Item]):
+    """Several outputs as one context: all appear at a clean end **or an interrupt** (with what was finished), none
+    after an error.
+
+    A reader of standard output who leaves early (``| head``) takes only that output away; :attr:`alive` says whether
+    anyone is still listening.
+    """
+
+    def __init__(self, sinks: Sequence[Sink[Item]]) -> None:
+        self._sinks = list(sinks)
+
+    @property
+    def alive(self) -> bool:
+        return bool(self._sinks)
+
+    def write(self, item: Item) -> None:
+        with _uninterrupted():
+            for sink in tuple(self._sinks):
+                try:
+                    sink.write(item)
+                except BrokenPipeError:
+                    self._sinks.remove(sink)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        finish = kind is None or issubclass(kind, KeyboardInterrupt)
+        with _uninterrupted():
+            while self._sinks:
+                sink = self._sinks.pop(0)
+                try:
+                    if finish:
+                        sink.finish()
+                    else:
+                        sink.abandon()
+                except BrokenPipeError:
+                    continue
+                except Exception:
+                    for other in self._sinks:
+                        other.abandon()
+                    raise
+
+
+def format_of(output: str) -> str:
+    """The suffix that chooses the format of ``-o``; ``-`` is CSV.
+
+    Raises:
+        InputError: another suffix; the message lists those there are.
+    """
+    suffix = ".csv" if output == STANDARD_OUTPUT else Path(output).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"-o {output}: the suffix chooses the format, and must be one of {', '.join(FORMATS)}")
+    return suffix
+
+
+def open_sinks(outputs: Sequence[str], encoding: Encoding[Item], standard_output: TextIO) -> Sinks[Item]:
+    """Sinks for the values of ``-o``; none means CSV on ``standard_output``.
+
+    Raises:
+        InputError: an unknown suffix, the same output twice, or a place that cannot be written; then nothing is left.
+    """
+    outputs = list(outputs) or [STANDARD_OUTPUT]
+    places = [output if output == STANDARD_OUTPUT else str(Path(output).resolve()) for output in outputs]
+    if len(set(places)) < len(places):
+        raise InputError(f"-o {' -o '.join(outputs)}: the same output twice")
+    kinds = [format_of(output) for output in outputs]
+    sinks: list[Sink[Item]] = []
+    try:
+        for output, kind in zip(outputs, kinds, strict=True):
+            sinks.append(_open(output, kind, encoding, standard_output))
+    except InputError:
+        for sink in sinks:
+            sink.abandon()
+        raise
+    return Sinks(sinks)
+
+
+def _open(output: str, kind: str, encoding: Encoding[Item], standard_output: TextIO) -> Sink[Item]:
+    if output == STANDARD_OUTPUT:
+        return CsvStream(standard_output, encoding)
+    if kind == ".csv":
+        return CsvFile(Path(output), encoding)
+    if kind == ".json":
+        return JsonFile(Path(output), encoding)
+    return JsonLinesFile(Path(output), encoding)
