@@ -23,6 +23,8 @@ class SpotSlice:
     info: SliceInfo
     spots: Spots
     problem: str = ""
+    #: the slice's number where a spots file gave one (it may have gaps); None: its place in the sequence
+    index: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
