@@ -1,9 +1,9 @@
 """YAML read strictly: every mistake with its place, no surprise types, no way to blow up.
 
 PyYAML turns ``no`` into False, ``012`` into ten, ``1e-3`` into text, and lets the last of two equal keys win. So only
-its node tree is used here: a scalar stays text until the schema says what it should be (an ``id: no`` is the text "no", a
-``diameter: 1e-3`` is a number), and every node remembers where it was written. Anchors, aliases and tags are refused: a
-frame file needs none, and nested aliases grow exponentially.
+its node tree is used here: a scalar stays text until the schema says what it should be (an ``id: no`` is the text
+"no", a ``diameter: 1e-3`` is a number), and every node remembers where it was written. Anchors, aliases and tags are
+refused: such a file needs none, and nested aliases grow exponentially.
 """
 
 from __future__ import annotations
@@ -121,7 +121,9 @@ class Document:
     mistakes: tuple[_Located, ...]
     error: type[InputError]
 
-    def validate(self, schema: type[Schema], checks: Callable[[dict[str, Any]], Iterable[Mistake]]) -> Schema:
+    def validate(
+        self, schema: type[Schema], checks: Callable[[dict[str, Any]], Iterable[Mistake]] = lambda _: ()
+    ) -> Schema:
         """The document as ``schema``; ``checks`` looks at the raw data for what one field alone cannot show.
 
         Raises:
