@@ -1,7 +1,7 @@
 """The truth about spots: where the axis of each rod passes through the middle of the slab.
 
-Written apart from :mod:`ctreg_cli.geometry.projection` on purpose, as the two-point form of a line: the simulator is the
-estimator's oracle and must not repeat its mistakes.
+Written apart from :mod:`ctreg_cli.geometry.projection` on purpose, as the two-point form of a line: the simulator is
+the estimator's oracle and must not repeat its mistakes.
 """
 
 from __future__ import annotations
@@ -67,8 +67,9 @@ def rod_diameters(model: RodModel, settings: ScannerSettings) -> FloatArray:
 def in_view(uv_px: FloatArray, settings: ScannerSettings) -> BoolArray:
     """(n,) whether places (n, 2) lie in the image, and not in its padding."""
     rows, columns = settings.shape
-    inside: BoolArray = ((uv_px >= -0.5) & (uv_px <= [columns - 0.5, rows - 0.5])).all(axis=1)
-    if settings.padding:
-        radii = np.linalg.norm(uv_px * settings.scale.mm_per_px - settings.centre_mm, axis=1)
-        inside &= radii <= settings.field_of_view_mm / 2
-    return inside
+    inside: BoolArray = np.logical_and(uv_px >= -0.5, uv_px <= [columns - 0.5, rows - 0.5]).all(axis=1)
+    if not settings.padding:
+        return inside
+    radii = np.linalg.norm(uv_px * settings.scale.mm_per_px - settings.centre_mm, axis=1)
+    round_view: BoolArray = inside & (radii <= settings.field_of_view_mm / 2)
+    return round_view

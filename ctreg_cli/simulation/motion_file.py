@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import math
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ctreg_cli.arrays import frozen
 from ctreg_cli.errors import InputError
-from ctreg_cli.simulation.motion import Trajectory
+from ctreg_cli.simulation.motion import MOTION_KINDS, Trajectory, slice_times
 
 POSE_COLUMNS = ("tx_mm", "ty_mm", "tz_mm", "qx", "qy", "qz", "qw")
 TIME_COLUMN = "time_s"
@@ -20,10 +22,35 @@ SHOWN_MISTAKES = 20
 NORM_TOLERANCE = 1e-3
 
 
+def read_motion(path: str | Path, interval_s: float, frames: int | None = None) -> Trajectory:
+    """The motion in a file, as :func:`parse_motion` reads it; only its first ``frames`` slices, if given.
+
+    Raises:
+        InputError: no such file, a mistake in it, or fewer poses than ``frames``.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no UTF-8 text"
+        raise InputError(
+            f"motion: {path}: cannot be read ({why}); give {', '.join(MOTION_KINDS)}, or a CSV file of poses"
+        ) from error
+    trajectory = parse_motion(text, str(path), interval_s)
+    if frames is None or frames == len(trajectory):
+        return trajectory
+    if frames > len(trajectory):
+        raise InputError(f"motion: {path} has {len(trajectory)} poses, fewer than the {frames} slices asked for")
+    return Trajectory(
+        times_s=trajectory.times_s[:frames],
+        T_slice_model=trajectory.T_slice_model[:frames],
+        plane_mm=trajectory.plane_mm[:frames],
+    )
+
+
 def parse_motion(text: str, source: str, interval_s: float) -> Trajectory:
     """Trajectory of a CSV with the columns ``tx_mm … qw`` and, if known, ``time_s``; one slice a row, in order.
 
-    Rows without a pose (a lost slice of a track) are left out. Without ``time_s`` slices follow each other by ``interval_s``.
+    Rows without a pose (a lost slice of a track) are left out. Without ``time_s`` a slice follows every ``interval_s``.
 
     Args:
         source: name of the file, for messages.
@@ -31,7 +58,7 @@ def parse_motion(text: str, source: str, interval_s: float) -> Trajectory:
     Raises:
         InputError: every mistake with file, line and column.
     """
-    table = csv.DictReader(text.removeprefix("\ufeff").splitlines())
+    table = csv.DictReader(text.splitlines())
     lacking = [name for name in POSE_COLUMNS if name not in (table.fieldnames or ())]
     if lacking:
         raise InputError(
@@ -69,8 +96,8 @@ def parse_motion(text: str, source: str, interval_s: float) -> Trajectory:
         raise InputError(f"{source}: holds no pose; a motion needs at least one row with {','.join(POSE_COLUMNS)}")
 
     known_times = [t for t in times if t is not None]
-    times_s = known_times or [i * interval_s for i in range(len(rows))]
-    if any(later <= earlier for earlier, later in zip(times_s, times_s[1:], strict=False)):
+    times_s = known_times or slice_times(len(rows), interval_s)
+    if any(later <= earlier for earlier, later in pairwise(times_s)):
         raise InputError(f"{source}: {TIME_COLUMN} must grow from row to row")
     values_array = np.array(rows)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))

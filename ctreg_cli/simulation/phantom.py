@@ -137,9 +137,7 @@ def digitise(image_hu: FloatArray, settings: ScannerSettings) -> NDArray[np.int1
     return stored
 
 
-def _absent_rods(
-    model: RodModel, visible: BoolArray, settings: ScannerSettings, rng: np.random.Generator
-) -> BoolArray:
+def _absent_rods(model: RodModel, visible: BoolArray, settings: ScannerSettings, rng: np.random.Generator) -> BoolArray:
     """(n,) rods that are not there: the named ones, and as many of those seen as were asked for."""
     unknown = sorted(set(settings.missing) - set(model.ids))
     if unknown:

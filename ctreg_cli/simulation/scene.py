@@ -32,7 +32,11 @@ RAY_TURNS, RAY_SHARE = (2, 3, 5), 0.6
 
 @lru_cache(maxsize=4)
 def body_hu(settings: ScannerSettings, radius_mm: float) -> FloatArray:
-    """(rows, columns) the patient without the frame, read-only; ``radius_mm`` is kept free of an abdomen, or holds a head."""
+    """(rows, columns) the patient without the frame, read-only.
+
+    Args:
+        radius_mm: of the frame: an abdomen lies below it, a head within it.
+    """
     image = np.full(settings.shape, AIR_HU)
     width, height = settings.extent_mm
     cx, cy = settings.centre_mm
@@ -74,7 +78,7 @@ def _ellipse(x_mm: float, y_mm: float, a_mm: float, b_mm: float, settings: Scann
 
 def _axes_mm(settings: ScannerSettings) -> tuple[FloatArray, FloatArray]:
     rows, columns = settings.shape
-    return np.arange(columns) * settings.scale.s_x, np.arange(rows) * settings.scale.s_y
+    return np.arange(float(columns)) * settings.scale.s_x, np.arange(float(rows)) * settings.scale.s_y
 
 
 def frame_radius_mm(model: RodModel) -> float:
@@ -83,8 +87,13 @@ def frame_radius_mm(model: RodModel) -> float:
     return float(np.linalg.norm(both, axis=1).max()) + BLOCK_MARGIN_MM
 
 
+def is_large(model: RodModel) -> bool:
+    """Whether a frame goes round a head; a smaller one is a solid block on a body."""
+    return 2 * frame_radius_mm(model) > SOLID_BLOCK_MM
+
+
 def block_patch(model: RodModel, T_slice_model: FloatArray, settings: ScannerSettings) -> Patch | None:
-    """Acrylic of the frame: the rods' box in the model axes, hollow along the slice's normal when the frame is large."""
+    """Acrylic of the frame: the rods' box in the model axes; of a large frame only the walls round its opening."""
     both = np.concatenate([model.starts, model.ends])
     low, high = both.min(axis=0) - BLOCK_MARGIN_MM, both.max(axis=0) + BLOCK_MARGIN_MM
     middle, half = (low + high) / 2, (high - low) / 2
@@ -101,7 +110,7 @@ def block_patch(model: RodModel, T_slice_model: FloatArray, settings: ScannerSet
 
     x, y = (np.arange(first[k], last[k]) * step[k] - centre[k] for k in (0, 1))
     edge = float(step.mean()) + settings.psf_fwhm_mm
-    hollow = 2 * half.max() > SOLID_BLOCK_MM
+    hollow = is_large(model)
     inner = half - WALL_MM
     inner[np.abs(R[2]).argmax()] = np.inf
     share = np.zeros((len(y), len(x)))
@@ -122,7 +131,9 @@ def _box_share(q_mm: list[FloatArray], half_mm: FloatArray, edge_mm: float) -> F
     return share
 
 
-def add_streaks(image_hu: FloatArray, spots_mm: FloatArray, settings: ScannerSettings, rng: np.random.Generator) -> None:
+def add_streaks(
+    image_hu: FloatArray, spots_mm: FloatArray, settings: ScannerSettings, rng: np.random.Generator
+) -> None:
     """Beam-hardening bands between metal spots (m, 2) and rays about each of them, in place.
 
     A sketch of what metal does in filtered back-projection: two rods starve the rays through both, which leaves a dark

@@ -18,6 +18,8 @@ from ctreg_cli.simulation.settings import ScannerSettings
 
 #: ``FrameResult.method`` of a pose that is not estimated but known
 METHOD = "simulated"
+#: sources are ``NAME_0000.dcm`` and so on
+NAME = "slice"
 
 
 def simulate_series(
@@ -26,7 +28,6 @@ def simulate_series(
     settings: ScannerSettings,
     R_patient_slice: FloatArray,
     rng: np.random.Generator,
-    name: str = "slice",
 ) -> Iterator[SimulatedSlice]:
     """The slices of a trajectory, each rendered when it is asked for.
 
@@ -34,7 +35,6 @@ def simulate_series(
 
     Args:
         R_patient_slice: (3, 3) columns are the slice's axes x, y and normal in patient coordinates (LPS).
-        name: sources are ``NAME_0000.dcm`` and so on.
     """
     digits = max(4, len(str(len(trajectory) - 1)))
     middle = np.array([*settings.centre_mm, 0.0])
@@ -43,10 +43,10 @@ def simulate_series(
         T_patient_slice[:3, :3] = R_patient_slice
         T_patient_slice[:3, 3] = R_patient_slice @ (np.array([0.0, 0.0, trajectory.plane_mm[i]]) - middle)
         info = SliceInfo(
-            source=f"{name}_{i:0{digits}}.dcm",
+            source=f"{NAME}_{i:0{digits}}.dcm",
             time_s=float(trajectory.times_s[i]),
             T_patient_slice=frozen(T_patient_slice, (4, 4)),
-            series=name,
+            series=NAME,
         )
         yield simulate_slice(model, trajectory.T_slice_model[i], settings, rng, info)
 

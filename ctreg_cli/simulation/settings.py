@@ -12,6 +12,8 @@ from ctreg_cli.scale import Scale
 Body = Literal["abdomen", "head", "none"]
 NoiseTexture = Literal["fbp", "white"]
 
+#: 512 px over 250 mm
+DEFAULT_SCALE = Scale(s_x=0.48828125, s_y=0.48828125)
 #: sides a simulated image may have, px
 MIN_SIDE_PX, MAX_SIDE_PX = 16, 4096
 
@@ -24,7 +26,7 @@ class ScannerSettings:
         InputError: a value outside what a scanner does; the sentence names the field.
     """
 
-    scale: Scale = Scale(s_x=0.48828125, s_y=0.48828125)
+    scale: Scale = DEFAULT_SCALE
     #: (rows, columns)
     shape: tuple[int, int] = (512, 512)
     #: thickness of the slab that is averaged into the slice
