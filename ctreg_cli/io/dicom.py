@@ -1,0 +1,275 @@
+"""One DICOM file → one record a frame, or one that says why it cannot be used.
+
+Read are CT and other grey images of integers: single-frame, classic multi-frame and enhanced (functional groups), with
+or without preamble and file meta, in any transfer syntax pydicom decodes. The geometry is checked, not believed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from sys import intern
+from typing import BinaryIO
+
+from pydicom.uid import UID
+
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.imaging.slice import SliceInfo
+from ctreg_cli.io.dicom_geometry import read_patient_from_slice, read_scale, read_thickness
+from ctreg_cli.io.dicom_header import (
+    Elements,
+    Header,
+    HeaderProblem,
+    looks_like_dicom,
+    open_binary,
+    problem,
+    read_header,
+    tag_name,
+)
+from ctreg_cli.io.dicom_pixels import (
+    Layout,
+    excess_bytes,
+    is_lossy,
+    locate,
+    read_layout,
+    read_padding,
+    read_rescale,
+)
+from ctreg_cli.io.dicom_time import delayed, frame_delays_s, read_clock
+from ctreg_cli.io.image_record import ImageRecord, Kind, Pixels, SeriesKey
+
+DICOM_SUFFIXES = frozenset({".dcm", ".dicom", ".dic", ".ima"})
+
+# codes of PS3.3 C.7.3.1.1.1 that a series of images may carry; anything else in Modality is not shown
+_MODALITIES = frozenset(
+    ("CT", "MR", "PT", "NM", "XA", "RF", "CR", "DX", "DR", "MG", "US", "OT", "SC", "SEG", "RTDOSE", "RTIMAGE", "OPT")
+)
+_LOCALIZER_WORDS = frozenset({"LOCALIZER", "SCOUT", "TOPOGRAM", "SURVIEW"})
+_CAPTURE_WORDS = frozenset({"SCREEN SAVE", "SCREENSAVE", "PROTOCOL", "DOSE_INFO"})
+_CAPTURE_CLASSES = "1.2.840.10008.5.1.4.1.1.7"
+_DIRECTORY_CLASS = "1.2.840.10008.1.3.10"
+_UIDS = {
+    "sop_instance": "SOPInstanceUID",
+    "series_instance": "SeriesInstanceUID",
+    "study_instance": "StudyInstanceUID",
+    "frame_of_reference": "FrameOfReferenceUID",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotAnImage:
+    """A sound DICOM file that never meant to be an image: a report, a structure set, a DICOMDIR."""
+
+
+def is_dicom(path: Path, head: bytes) -> bool:
+    """Whether a file is, or says by its name that it is, DICOM; ``head`` are its first 132 bytes or more."""
+    return looks_like_dicom(head) or path.suffix.lower() in DICOM_SUFFIXES
+
+
+def read_dicom(path: Path, source: str) -> list[ImageRecord] | NotAnImage:
+    """Read the header of one file; pixels are read later, by :meth:`ImageRecord.load`.
+
+    Args:
+        path: the file.
+        source: its name in results; ``#1``, ``#2``, ... is added in a multi-frame file.
+
+    Returns:
+        A record a frame, in the file's order. A file that cannot be used is one record with a ``problem``.
+    """
+    info = SliceInfo(source=source)
+    lost = SeriesKey(None, Kind.SLICE, "")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what pydicom finds odd is either checked here or harmless
+        try:
+            with open_binary(path) as file:
+                return _read(path, source, file)
+        except HeaderProblem as error:
+            return [ImageRecord(info=info, series=lost, problem=str(error))]
+        except RecursionError:
+            return [ImageRecord(info=info, series=lost, problem="its sequences are nested too deeply")]
+        # The one door for hostile files. Walking through damaged elements, pydicom raises struct.error, EOFError,
+        # OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, OverflowError and more.
+        except Exception:  # noqa: BLE001
+            return [ImageRecord(info=info, series=lost, problem="its header is damaged")]
+
+
+def _read(path: Path, source: str, file: BinaryIO) -> list[ImageRecord] | NotAnImage:
+    size = path.stat().st_size
+    if size == 0:
+        raise HeaderProblem("the file is empty")
+    header = read_header(file, size)
+    if _is_not_an_image(header):
+        return NotAnImage()
+    series = _series_key(path, header.elements)
+    try:
+        return _records(path, source, header, series)
+    except HeaderProblem as error:  # which series it belongs to, and when it was taken, is known all the same
+        info = SliceInfo(source=source, uids=_uids(header.elements))
+        return [_with_place(ImageRecord(info=info, series=series, problem=str(error)), header)]
+
+
+def _is_not_an_image(header: Header) -> bool:
+    sop_class = header.meta.uid("MediaStorageSOPClassUID") or header.elements.uid("SOPClassUID")
+    if sop_class == _DIRECTORY_CLASS:
+        return True
+    has_image = header.pixels is not None or "Rows" in header.elements
+    # the name is the standard's; a class it does not know is its own name
+    return not has_image and sop_class != "" and "Image Storage" not in UID(sop_class).name
+
+
+def _series_key(path: Path, elements: Elements) -> SeriesKey:
+    image_type = set(elements.codes("ImageType"))
+    if image_type & _LOCALIZER_WORDS:
+        kind = Kind.LOCALIZER
+    elif elements.uid("SOPClassUID").startswith(_CAPTURE_CLASSES) or image_type & _CAPTURE_WORDS:
+        kind = Kind.CAPTURE
+    else:
+        kind = Kind.SLICE
+    modality = elements.text("Modality").upper()
+    identity = elements.uid("SeriesInstanceUID") or f"folder {path.parent.as_posix()}"
+    return SeriesKey(intern(identity), kind, intern(modality) if modality in _MODALITIES else "")
+
+
+def _uids(elements: Elements) -> dict[str, str]:
+    uids = {name: elements.uid(keyword) for name, keyword in _UIDS.items()}
+    return {name: intern(uid) for name, uid in uids.items() if uid}
+
+
+def _with_place(record: ImageRecord, header: Header) -> ImageRecord:
+    """The record with its place in the series: time and instance number."""
+    try:
+        instance = header.elements.integer("InstanceNumber")
+    except HeaderProblem:
+        instance = None
+    return dataclasses.replace(record, clock=read_clock(header.elements), instance=instance)
+
+
+def _records(path: Path, source: str, header: Header, series: SeriesKey) -> list[ImageRecord]:
+    elements = header.elements
+    layout = read_layout(elements)
+    info = SliceInfo(source=source, shape=(layout.rows, layout.columns), uids=_uids(elements))
+    whole = _with_place(
+        ImageRecord(
+            info=info,
+            series=series,
+            padding=read_padding(elements, layout),
+            notes=_notes(header, layout),
+        ),
+        header,
+    )
+    pixels = locate(path, header, layout)
+    shared = elements.items("SharedFunctionalGroupsSequence")
+    own = elements.items("PerFrameFunctionalGroupsSequence")
+    if shared or own:
+        return _enhanced_frames(whole, elements, layout, pixels, shared, own)
+    slope, intercept = read_rescale(elements, layout)
+    info = _with_geometry(info, elements, elements, elements)
+    record = dataclasses.replace(whole, info=info, pixels=pixels[0], slope=slope, intercept=intercept)
+    return [record] if layout.n_frames == 1 else _classic_frames(record, elements, pixels)
+
+
+def _with_geometry(info: SliceInfo, measures: Elements, position: Elements, orientation: Elements) -> SliceInfo:
+    return dataclasses.replace(
+        info,
+        scale=read_scale(measures),
+        thickness_mm=read_thickness(measures),
+        T_patient_slice=read_patient_from_slice(position, orientation),
+    )
+
+
+def _classic_frames(record: ImageRecord, elements: Elements, pixels: list[Pixels]) -> list[ImageRecord]:
+    """Frames of one place after another in time, or of unknown places.
+
+    Without functional groups only time (Frame Time, Frame Time Vector) or depth (Grid Frame Offset Vector) is said of
+    a frame. Where neither is, the frames may be anywhere: then none keeps the position that is written for the first.
+    """
+    n = len(pixels)
+    delays_s = frame_delays_s(elements, n)
+    depths_mm = elements.decimals("GridFrameOffsetVector")
+    frames = []
+    for k in range(n):
+        T = record.info.T_patient_slice
+        if depths_mm is not None and len(depths_mm) == n:
+            T = _moved(T, depths_mm[k] - depths_mm[0])
+        elif delays_s is None:
+            T = None
+        frames.append(
+            dataclasses.replace(
+                record,
+                info=dataclasses.replace(record.info, source=f"{record.info.source}#{k + 1}", T_patient_slice=T),
+                pixels=pixels[k],
+                clock=delayed(record.clock, delays_s[k]) if delays_s else record.clock,
+            )
+        )
+    return frames
+
+
+def _moved(T: FloatArray | None, depth_mm: float) -> FloatArray | None:
+    if T is None:
+        return None
+    moved = T.copy()
+    moved[:3, 3] += depth_mm * T[:3, 2]
+    moved.flags.writeable = False
+    return moved
+
+
+def _enhanced_frames(
+    whole: ImageRecord,
+    elements: Elements,
+    layout: Layout,
+    pixels: list[Pixels],
+    shared: list[Elements],
+    own: list[Elements],
+) -> list[ImageRecord]:
+    """Frames of an enhanced file: what its own functional groups say, else the shared ones, else the file."""
+    if own and len(own) != layout.n_frames:
+        raise problem("PerFrameFunctionalGroupsSequence", f"describes {len(own)} of {layout.n_frames} frames")
+    shared_macros = _macros(shared[0]) if shared else {}
+    nothing = Elements({}, elements.little_endian)
+    frames = []
+    for k in range(layout.n_frames):
+        source = f"{whole.info.source}#{k + 1}" if layout.n_frames > 1 else whole.info.source
+        info = dataclasses.replace(whole.info, source=source)
+        try:
+            macros = shared_macros | (_macros(own[k]) if own else {})
+            measures, position, orientation, transform = (macros.get(name, elements) for name in _GEOMETRY_MACROS)
+            slope, intercept = read_rescale(transform, layout)
+            frame = dataclasses.replace(
+                whole,
+                info=_with_geometry(info, measures, position, orientation),
+                pixels=pixels[k],
+                slope=slope,
+                intercept=intercept,
+                clock=read_clock(elements, macros.get("FrameContentSequence", nothing)),
+            )
+        except HeaderProblem as error:
+            frame = dataclasses.replace(whole, info=info, problem=str(error))
+        frames.append(frame)
+    return frames
+
+
+_GEOMETRY_MACROS = (
+    "PixelMeasuresSequence",
+    "PlanePositionSequence",
+    "PlaneOrientationSequence",
+    "PixelValueTransformationSequence",
+)
+
+
+def _macros(group: Elements) -> dict[str, Elements]:
+    """The functional groups of one item, those that are there."""
+    found = {name: group.items(name) for name in (*_GEOMETRY_MACROS, "FrameContentSequence")}
+    return {name: items[0] for name, items in found.items() if items}
+
+
+def _notes(header: Header, layout: Layout) -> tuple[str, ...]:
+    notes = list(header.notes)
+    if is_lossy(header):
+        notes.append("lossy compression: spots may have moved")
+    if layout.inverted:
+        notes.append("MONOCHROME1, read with small stored values as bright")
+    if excess_bytes(header, layout):
+        notes.append(f"bytes beyond the image in {tag_name('PixelData')}, left aside")
+    return tuple(notes)

@@ -1,0 +1,431 @@
+"""The pixels of a DICOM image: checked against the file before anything is allocated, read one frame at a time.
+
+Uncompressed frames are read straight from their place in the file. Compressed ones go to pydicom's decoders, after the
+size written in the codestream itself was compared with Rows and Columns: no decoder is let loose on an image whose size
+nobody agreed to.
+"""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydicom.encaps import encapsulate, get_frame
+from pydicom.pixels import get_decoder
+from pydicom.uid import (
+    UID,
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEG2000TransferSyntaxes,
+    JPEGBaseline8Bit,
+    JPEGExtended12Bit,
+    JPEGLSTransferSyntaxes,
+    JPEGTransferSyntaxes,
+    RLELossless,
+)
+
+from ctreg_cli.errors import UnreadableSliceError
+from ctreg_cli.io.dicom_header import (
+    Elements,
+    Header,
+    HeaderProblem,
+    PixelElement,
+    inflate,
+    open_binary,
+    problem,
+    tag_name,
+)
+from ctreg_cli.io.image_record import Pixels
+
+#: the largest CT matrices are 2048 × 2048; a small file must not claim gigabytes
+MAX_PIXELS = 2**25
+#: an encapsulated frame has an item header of its own, so a file holds no more frames than this allows
+MIN_ENCAPSULATED_FRAME_BYTES = 8
+
+CODECS_REMEDY = "pip install 'ctreg-cli[codecs]'"
+_NATIVE = (ImplicitVRLittleEndian, ExplicitVRLittleEndian, ExplicitVRBigEndian, DeflatedExplicitVRLittleEndian)
+_CODEC_NAMES: dict[str, str] = {
+    **dict.fromkeys(JPEGTransferSyntaxes, "JPEG Lossless"),
+    JPEGBaseline8Bit: "JPEG",
+    JPEGExtended12Bit: "JPEG Extended",
+    **dict.fromkeys(JPEGLSTransferSyntaxes, "JPEG-LS"),
+    **dict.fromkeys([uid for uid in JPEG2000TransferSyntaxes if "2000" in uid.name], "JPEG 2000"),
+    RLELossless: "RLE",
+}
+_ALWAYS_LOSSY = (JPEGBaseline8Bit, JPEGExtended12Bit, "1.2.840.10008.1.2.4.81")
+_GREY = {"MONOCHROME1", "MONOCHROME2"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """How one frame is stored."""
+
+    rows: int
+    columns: int
+    bits_allocated: int
+    bits_stored: int
+    signed: bool
+    #: small stored values are bright
+    inverted: bool
+    n_frames: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the stored values, in this machine's byte order."""
+        return np.dtype(f"{'i' if self.signed else 'u'}{self.bits_allocated // 8}")
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one uncompressed frame."""
+        return self.rows * self.columns * self.bits_allocated // 8
+
+    @property
+    def stored_range(self) -> tuple[int, int]:
+        """Least and greatest value that Bits Stored can hold."""
+        n = 2**self.bits_stored
+        return (-n // 2, n // 2 - 1) if self.signed else (0, n - 1)
+
+
+def read_layout(elements: Elements) -> Layout:
+    """The Image Pixel attributes.
+
+    Raises:
+        HeaderProblem: one of them is missing, malformed, or describes no grey image of integers.
+    """
+    photometric = elements.text("PhotometricInterpretation")
+    samples = elements.integer("SamplesPerPixel")
+    if samples not in (None, 1) or photometric not in _GREY:
+        if not photometric:
+            raise problem("PhotometricInterpretation", "is missing")
+        raise problem("PhotometricInterpretation", "is not MONOCHROME1 or MONOCHROME2: colour is no CT slice")
+    rows, columns = (_required(elements, keyword) for keyword in ("Rows", "Columns"))
+    for keyword, value in (("Rows", rows), ("Columns", columns)):
+        if value < 1:
+            raise problem(keyword, "is 0")
+    if rows * columns > MAX_PIXELS:
+        raise problem("Rows", f"times Columns is {rows * columns} pixels, more than the {MAX_PIXELS} allowed")
+    allocated = _required(elements, "BitsAllocated")
+    if allocated not in (8, 16, 32):
+        raise problem("BitsAllocated", f"is {allocated}, not 8, 16 or 32")
+    stored = elements.integer("BitsStored")
+    stored = allocated if stored is None else stored
+    if not 1 <= stored <= allocated:
+        raise problem("BitsStored", f"is {stored}, where {allocated} are allocated")
+    high_bit = elements.integer("HighBit")
+    if high_bit is not None and high_bit != stored - 1:
+        raise problem("HighBit", f"is {high_bit}, where {stored} bits are stored")
+    representation = _required(elements, "PixelRepresentation")
+    if representation not in (0, 1):
+        raise problem("PixelRepresentation", "is not 0 or 1")
+    n_frames = elements.integer("NumberOfFrames")
+    if n_frames is not None and n_frames < 0:
+        raise problem("NumberOfFrames", "is negative")
+    return Layout(
+        rows=rows,
+        columns=columns,
+        bits_allocated=allocated,
+        bits_stored=stored,
+        signed=representation == 1,
+        inverted=photometric == "MONOCHROME1",
+        n_frames=n_frames or 1,
+    )
+
+
+def read_rescale(elements: Elements, layout: Layout) -> tuple[float, float]:
+    """(slope, intercept) of ``value = slope * stored + intercept``; 1 and 0 where the file has none.
+
+    A MONOCHROME1 image stores bright as small: its scale is turned round within the range of Bits Stored, unless its
+    slope is negative and so has done that already.
+
+    Raises:
+        HeaderProblem: malformed, a slope of 0, or a look-up table in their place.
+    """
+    slope, intercept = elements.decimal("RescaleSlope"), elements.decimal("RescaleIntercept")
+    if slope is None and "ModalityLUTSequence" in elements:
+        raise problem("ModalityLUTSequence", "is not supported")
+    slope, intercept = 1.0 if slope is None else slope, intercept or 0.0
+    if slope == 0:
+        raise problem("RescaleSlope", "is 0")
+    if layout.inverted and slope > 0:
+        return -slope, intercept + slope * sum(layout.stored_range)
+    return slope, intercept
+
+
+def read_padding(elements: Elements, layout: Layout) -> tuple[float, float] | None:
+    """Inclusive range of stored values that are no image (PS3.3 C.7.5.1.1.2), or None."""
+    value = elements.integer("PixelPaddingValue", signed=layout.signed)
+    if value is None:
+        return None
+    limit = elements.integer("PixelPaddingRangeLimit", signed=layout.signed)
+    other = value if limit is None else limit
+    return float(min(value, other)), float(max(value, other))
+
+
+def locate(path: Path, header: Header, layout: Layout) -> list[Pixels]:
+    """A reader a frame; nothing is read yet, but all that can be known from sizes is checked.
+
+    Raises:
+        HeaderProblem: no pixels, a kind that cannot be decoded, or a length that does not fit Rows × Columns.
+    """
+    element = header.pixels
+    if element is None:
+        raise problem("PixelData", "is missing: the file may be cut short")
+    if element.keyword != "PixelData":
+        raise problem(element.keyword, "holds floating-point pixels, which no CT scanner stores")
+    if header.transfer_syntax in _NATIVE:
+        return _locate_native(path, header, element, layout)
+    return _locate_encapsulated(path, header, element, layout)
+
+
+def is_lossy(header: Header) -> bool:
+    """Whether the image went through lossy compression at some time, as far as the file says."""
+    return header.elements.text("LossyImageCompression") == "01" or header.transfer_syntax in _ALWAYS_LOSSY
+
+
+def excess_bytes(header: Header, layout: Layout) -> int:
+    """Bytes of uncompressed Pixel Data beyond the frames (and the one that makes the length even)."""
+    if header.pixels is None or header.pixels.length is None:
+        return 0
+    expected = layout.frame_bytes * layout.n_frames
+    return max(0, header.pixels.length - expected - expected % 2)
+
+
+def _required(elements: Elements, keyword: str) -> int:
+    value = elements.integer(keyword)
+    if value is None:
+        raise problem(keyword, "is missing")
+    return value
+
+
+def _locate_native(path: Path, header: Header, element: PixelElement, layout: Layout) -> list[Pixels]:
+    needed = layout.frame_bytes * layout.n_frames
+    if element.length is None:
+        raise problem("PixelData", "has no length, though its transfer syntax is uncompressed")
+    if element.offset + needed > header.size and not header.more:
+        raise problem("PixelData", f"ends after {max(0, header.size - element.offset)} of {needed} bytes: cut short")
+    if element.length < needed:
+        raise problem("PixelData", f"holds {element.length} bytes, where Rows × Columns asks for {needed}")
+    # a row or a column more would mean that Rows or Columns is wrong, and the image sheared
+    if excess_bytes(header, layout) >= min(layout.rows, layout.columns) * layout.bits_allocated // 8:
+        raise problem("PixelData", f"holds {element.length} bytes, where Rows × Columns asks for {needed}")
+    little = header.elements.little_endian
+    if header.deflated_from is not None:
+        return [
+            DeflatedPixels(
+                path=str(path),
+                start=header.deflated_from,
+                offset=element.offset + frame * layout.frame_bytes,
+                layout=layout,
+            )
+            for frame in range(layout.n_frames)
+        ]
+    return [
+        NativePixels(
+            path=str(path),
+            offset=element.offset + frame * layout.frame_bytes,
+            layout=layout,
+            little_endian=little,
+            swapped_words=not little and layout.bits_allocated == 8 and element.vr == "OW",
+        )
+        for frame in range(layout.n_frames)
+    ]
+
+
+def _locate_encapsulated(path: Path, header: Header, element: PixelElement, layout: Layout) -> list[Pixels]:
+    name = _CODEC_NAMES.get(header.transfer_syntax)
+    if name is None:
+        raise problem("TransferSyntaxUID", "names a compression that is not supported")
+    if not codec_available(header.transfer_syntax):
+        raise HeaderProblem(f"the image is compressed by {name}; to read it: {CODECS_REMEDY}")
+    if element.length is not None:
+        raise problem("PixelData", "has a length, though its transfer syntax is compressed")
+    if layout.n_frames > (header.size - element.offset) // MIN_ENCAPSULATED_FRAME_BYTES:
+        raise problem("NumberOfFrames", f"is {layout.n_frames}, more than the file can hold")
+    offsets = header.elements.bytes("ExtendedOffsetTable")
+    lengths = header.elements.bytes("ExtendedOffsetTableLengths")
+    return [
+        EncapsulatedPixels(
+            path=str(path),
+            offset=element.offset,
+            frame=frame,
+            layout=layout,
+            transfer_syntax=header.transfer_syntax,
+            extended_offsets=(offsets, lengths) if offsets and lengths else None,
+        )
+        for frame in range(layout.n_frames)
+    ]
+
+
+@lru_cache(maxsize=32)
+def codec_available(transfer_syntax: str) -> bool:
+    """Whether a decoder for this compression is installed."""
+    return bool(get_decoder(transfer_syntax).is_available)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NativePixels:
+    """An uncompressed frame at a known place of a file."""
+
+    path: str
+    offset: int
+    layout: Layout
+    little_endian: bool = True
+    #: 8-bit pixels written as big-endian words: every pair changed places (PS3.5 8.1.2)
+    swapped_words: bool = False
+
+    def load(self) -> NDArray[Any]:
+        """Read the frame; the array is read-only."""
+        layout, count = self.layout, self.layout.rows * self.layout.columns
+        dtype = layout.dtype.newbyteorder("<" if self.little_endian else ">")
+        if self.swapped_words:
+            start = self.offset - self.offset % 2  # words begin at even places, in the file as in DICOM's values
+            words = self._read(np.dtype("u2"), (self.offset - start + count + 1) // 2, start)
+            stored = words.byteswap().view(dtype)[self.offset - start :][:count]
+        else:
+            stored = self._read(dtype, count, self.offset)
+        return _finished(stored, layout)
+
+    def _read(self, dtype: np.dtype[Any], count: int, offset: int) -> NDArray[Any]:
+        try:
+            stored = np.fromfile(self.path, dtype=dtype, count=count, offset=offset)
+        except OSError as error:
+            raise UnreadableSliceError(f"the file cannot be read ({error.strerror})") from None
+        if stored.size != count:
+            raise UnreadableSliceError(f"{tag_name('PixelData')} is cut short")
+        return stored
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeflatedPixels:
+    """An uncompressed frame inside a deflated data set."""
+
+    path: str
+    #: where the deflated data set begins in the file
+    start: int
+    #: of the frame in the inflated data set
+    offset: int
+    layout: Layout
+
+    def load(self) -> NDArray[Any]:
+        """Inflate up to the end of the frame."""
+        try:
+            with open_binary(Path(self.path)) as file:
+                file.seek(self.start)
+                inflated, _ = inflate(file, self.offset + self.layout.frame_bytes)
+        except HeaderProblem as error:
+            raise UnreadableSliceError(str(error)) from None
+        frame = inflated[self.offset :]
+        if len(frame) < self.layout.frame_bytes:
+            raise UnreadableSliceError(f"{tag_name('PixelData')} is cut short")
+        dtype = self.layout.dtype.newbyteorder("<")
+        return _finished(np.frombuffer(frame, dtype=dtype, count=self.layout.rows * self.layout.columns), self.layout)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncapsulatedPixels:
+    """A compressed frame."""
+
+    path: str
+    #: of the basic offset table's item
+    offset: int
+    frame: int
+    layout: Layout
+    transfer_syntax: UID
+    extended_offsets: tuple[bytes, bytes] | None
+
+    def load(self) -> NDArray[Any]:
+        """Decode the frame."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                stored = self._decode()
+            except HeaderProblem as error:
+                raise UnreadableSliceError(str(error)) from None
+            # the door to the decoders: a damaged codestream makes them raise whatever they like
+            except Exception:  # noqa: BLE001
+                raise UnreadableSliceError(f"{tag_name('PixelData')} cannot be decoded: it is damaged") from None
+        stored.flags.writeable = False
+        return stored
+
+    def _decode(self) -> NDArray[Any]:
+        layout = self.layout
+        with open_binary(Path(self.path)) as file:
+            file.seek(self.offset)
+            codestream = get_frame(
+                file, self.frame, number_of_frames=layout.n_frames, extended_offsets=self.extended_offsets
+            )
+        shape = codestream_shape(codestream)
+        if self.transfer_syntax != RLELossless and shape != (layout.rows, layout.columns):
+            raise problem("PixelData", "holds a codestream of another size than Rows × Columns, or a damaged one")
+        _silence_gdcm()
+        stored, _ = get_decoder(self.transfer_syntax).as_array(
+            encapsulate([codestream], has_bot=False),
+            index=0,
+            raw=True,
+            rows=layout.rows,
+            columns=layout.columns,
+            number_of_frames=1,
+            samples_per_pixel=1,
+            photometric_interpretation="MONOCHROME2",
+            bits_allocated=layout.bits_allocated,
+            bits_stored=layout.bits_stored,
+            pixel_representation=int(layout.signed),
+            pixel_keyword="PixelData",
+        )
+        result: NDArray[Any] = stored
+        return result
+
+
+def codestream_shape(codestream: bytes) -> tuple[int, int] | None:
+    """(rows, columns) as a JPEG, JPEG-LS or JPEG 2000 codestream states them; None if it is none of these."""
+    if (start := codestream[:512].find(b"\xff\x4f\xff\x51")) >= 0:  # SOC, SIZ; a JP2 box may stand before
+        size = codestream[start + 8 : start + 24]
+        if len(size) < 16:
+            return None
+        width, height, left, top = struct.unpack(">4I", size)
+        return height - top, width - left
+    if codestream[:2] != b"\xff\xd8":
+        return None
+    place = 2
+    while place + 9 <= len(codestream) and codestream[place] == 0xFF:
+        marker, length = codestream[place + 1], int.from_bytes(codestream[place + 2 : place + 4], "big")
+        if marker == 0xFF:  # fill byte
+            place += 1
+        elif marker == 0xF7 or (0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC)):  # a start of frame
+            rows, columns = struct.unpack(">2H", codestream[place + 5 : place + 9])
+            return rows, columns
+        else:
+            place += 2 + length
+    return None
+
+
+def _finished(stored: NDArray[Any], layout: Layout) -> NDArray[Any]:
+    """Native byte order, two dimensions, and nothing in the bits beyond Bits Stored (old overlays live there)."""
+    stored = stored.astype(layout.dtype, copy=False).reshape(layout.rows, layout.columns)
+    if layout.bits_stored < layout.bits_allocated:
+        low, high = layout.stored_range
+        # looking is ten times cheaper than shifting, and nearly always all there is to do
+        if stored.max() > high or (layout.signed and stored.min() < low):
+            unused = layout.bits_allocated - layout.bits_stored
+            stored = np.right_shift(np.left_shift(stored, unused), unused)
+    stored.flags.writeable = False
+    return stored
+
+
+@lru_cache(maxsize=1)
+def _silence_gdcm() -> None:
+    """GDCM writes its complaints straight to standard error."""
+    try:
+        import gdcm
+    except ImportError:
+        return
+    for off in (gdcm.Trace.DebugOff, gdcm.Trace.WarningOff, gdcm.Trace.ErrorOff):
+        off()
