@@ -5,12 +5,23 @@ Everything is a generator, so that a progress bar, a robot and a file can each t
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.errors import MissingScaleError
+from ctreg_cli.geometry.plucker import skew
+from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.result import Candidate, Status
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.register import register
+from ctreg_cli.registration.result import Candidate, Registration, Status
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,3 +74,131 @@ class FrameResult:
 
 
 SliceLike = Slice | SpotSlice | UnreadableSlice
+
+
+def segment(slices: Iterable[SliceLike], options: SegmentationOptions) -> Iterator[SpotSlice]:
+    """Spots of every slice; what already is spots, or could not be read, passes through."""
+    for slice_ in slices:
+        yield spots_of(slice_, options)
+
+
+def spots_of(slice_: SliceLike, options: SegmentationOptions) -> SpotSlice:
+    """The spots of one slice."""
+    match slice_:
+        case SpotSlice():
+            return slice_
+        case UnreadableSlice():
+            return SpotSlice(info=slice_.info, spots=no_spots(), problem=slice_.problem)
+        case Slice():
+            return SpotSlice(info=slice_.info, spots=find_spots(slice_, options))
+
+
+def no_spots() -> Spots:
+    """A slice in which nothing was found."""
+    return Spots(uv_px=np.empty((0, 2)), covariance_px=np.empty((0, 2, 2)))
+
+
+def pose(
+    slices: Iterable[SliceLike],
+    model: RodModel,
+    *,
+    scale: Scale | None = None,
+    options: RegistrationOptions | None = None,
+    segmentation: SegmentationOptions | None = None,
+) -> Iterator[FrameResult]:
+    """Every slice on its own: one result for each, in order, as soon as it is there.
+
+    Args:
+        slices: images, or spots.
+        model: the rods.
+        scale: mm per pixel for all slices; None: each slice's own.
+        options: see :class:`RegistrationOptions`.
+        segmentation: see :class:`SegmentationOptions`.
+
+    Raises:
+        MissingScaleError: a slice has no scale and none was given.
+    """
+    options = options or RegistrationOptions()
+    segmentation = segmentation or SegmentationOptions()
+    for place, item in enumerate(segment(slices, segmentation)):
+        yield register_slice(place, item, model, scale=scale, options=options)
+
+
+def register_slice(
+    place: int, item: SpotSlice, model: RodModel, *, scale: Scale | None, options: RegistrationOptions
+) -> FrameResult:
+    """The pose in one slice without any past."""
+    index = place if item.index is None else item.index
+    if item.problem:
+        return failure(index, item, "unreadable")
+    registration = register(
+        item.spots,
+        model,
+        scale=scale_of(item, scale),
+        T_patient_slice=item.info.T_patient_slice,
+        thickness_mm=item.info.thickness_mm,
+        shape=item.info.shape,
+        options=options,
+    )
+    return frame_result(index, item, model, registration, method="registered")
+
+
+def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
+    """The scale to use for a slice.
+
+    Raises:
+        MissingScaleError: it has none, and none was given.
+    """
+    scale = override or item.info.scale
+    if scale is None:
+        raise MissingScaleError(
+            f"{item.info.source}: no pixel scale in the input; give --scale SX SY (mm per pixel) or -c CALIBRATION"
+        )
+    return scale
+
+
+def failure(index: int, item: SpotSlice, reason: str) -> FrameResult:
+    """A slice without a pose."""
+    return FrameResult(index=index, info=item.info, spots=item.spots, status="no_pose", reason=reason, method="")
+
+
+def frame_result(
+    index: int,
+    item: SpotSlice,
+    model: RodModel,
+    registration: Registration,
+    *,
+    method: str,
+    stability: float | None = None,
+) -> FrameResult:
+    """A verdict, with the targets' places and accuracy, as a row."""
+    best = registration.best
+    return FrameResult(
+        index=index,
+        info=item.info,
+        spots=item.spots,
+        status=registration.status,
+        reason=registration.reason,
+        method=method if best is not None else "",
+        candidates=registration.candidates,
+        targets=() if best is None else target_accuracy(model, best, item.info.T_patient_slice),
+        warnings=registration.warnings,
+        stability=stability,
+    )
+
+
+def target_accuracy(model: RodModel, best: Candidate, T_patient_slice: FloatArray | None) -> tuple[TargetAccuracy, ...]:
+    """Where the frame's targets are, and the predicted rms error there (TRE), from the pose covariance.
+
+    ``δP = V + Ω × (R p)``, so that cov(P) = G C Gᵀ with ``G = [I₃ | −[R p]ₓ]``. The size of the residual says nothing of it.
+    """
+    result = []
+    T = best.T_slice_model
+    for target in model.targets:
+        arm = T[:3, :3] @ target.point
+        G = np.hstack([np.eye(3), -skew(arm)])
+        position = arm + T[:3, 3]
+        patient = None if T_patient_slice is None else T_patient_slice[:3, :3] @ position + T_patient_slice[:3, 3]
+        tre = math.sqrt(float(np.trace(G @ best.covariance @ G.T)))
+        result.append(TargetAccuracy(id=target.id, position_slice=position, position_patient=patient, tre_mm=tre))
+    return tuple(result)

@@ -1,0 +1,119 @@
+"""How much a match is worth: its Bayesian odds against chance.
+
+As astrometry.net decides whether it has recognised a field of stars (Lang et al. 2010), a match is accepted for its odds,
+not for its residual. The two stories told about ``m`` spots in the frame's neighbourhood of area ``A``:
+
+* *chance*: all are clutter, scattered at an unknown density (Jeffreys' prior on it, integrated out);
+* *the frame is here*: at pose θ, ``n`` of the rods the slice cuts were seen (each with probability ``p``), with residuals
+  ``r_i ~ N(0, S_i)``; ``q`` were not; the other ``m − n`` spots are clutter.
+
+The pose is integrated out over its prior by Laplace's method, which charges a match for every pose it could have had:
+
+    ln E = ln π(θ) + 3 ln 2π + ½ ln|C| + Σ_i [ln p − ½ r_iᵀ S_i⁻¹ r_i − ln 2π − ½ ln|S_i|]
+           + n ln A + ln Γ(m − n + ½) − ln Γ(m + ½) + q ln(1 − p)
+
+with C the pose covariance and π(θ) the prior density (uniform in position over the searched field, uniform in rotation over
+all of SO(3), or over the mount's cone). ``Γ(m + ½)/Γ(m − n + ½)`` is the number of ways to pick the n spots. Under *chance*
+the sum of E over all matches and poses has the mean 1, so by Markov's inequality a slice of pure clutter reaches ln E > x
+with a probability of at most exp(−x); ``benchmarks/accuracy.py`` measures it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln
+
+from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.geometry.pose import rotation_angle
+from ctreg_cli.registration.refine import Linearisation, covariance_from_information
+from ctreg_cli.rods import RodModel
+
+#: probability that a rod the slice cuts leaves a spot the segmentation finds
+P_SEEN = 0.8
+#: radius of the frame's neighbourhood, in units of the farthest crossing from their centre
+_NEIGHBOURHOOD = 1.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePrior:
+    """What is known of the pose before looking at the spots: a cone of rotations about a nominal one, or nothing."""
+
+    #: (3, 3) nominal rotation model → slice; None: any
+    rotation: FloatArray | None = None
+    max_angle_rad: float = math.pi
+
+    @property
+    def rotation_volume(self) -> float:
+        """Volume of the allowed rotations in rad³ (all of SO(3): 8π²)."""
+        if self.rotation is None:
+            return 8 * math.pi**2
+        return 8 * math.pi * (self.max_angle_rad - math.sin(self.max_angle_rad))
+
+    def allows(self, R: FloatArray) -> BoolArray:
+        """Which rotations (..., 3, 3) lie within the cone."""
+        if self.rotation is None:
+            return np.ones(R.shape[:-2], dtype=bool)
+        inside: BoolArray = rotation_angle(R @ self.rotation.T) <= self.max_angle_rad
+        return inside
+
+
+def log_odds(
+    model: RodModel,
+    prior: PosePrior,
+    spots_mm: FloatArray,
+    T: FloatArray,
+    fit: Linearisation,
+    matched: BoolArray,
+    expected: BoolArray,
+) -> FloatArray:
+    """ln E (b,) of ``b`` refined hypotheses, in slice millimetres.
+
+    Args:
+        model: the rods.
+        prior: what is known of the pose.
+        spots_mm: (m, 2) every spot of the slice, mm.
+        T: (b, 4, 4) refined poses.
+        fit: their linearisation, in millimetres.
+        matched: (b, n) rods with a spot.
+        expected: (b, n) rods that would have to be seen, matched or not.
+    """
+    crossing = fit.predicted_px
+    seen = matched | expected
+    n_seen = np.maximum(seen.sum(axis=1), 1)
+    usable = seen & np.isfinite(crossing).all(axis=-1)
+    crossing = np.where(usable[..., None], crossing, 0.0)
+    centre = crossing.sum(axis=1) / n_seen[:, None]
+    reach = np.where(usable, np.linalg.norm(crossing - centre[:, None], axis=-1), 0).max(axis=1)
+    reach = _NEIGHBOURHOOD * np.maximum(reach, 1e-3 * model.size_mm)
+    near = np.linalg.norm(spots_mm[None] - centre[:, None], axis=-1) <= reach[:, None]
+    n = matched.sum(axis=1)
+    m = np.maximum(near.sum(axis=1), n)
+    area = math.pi * reach**2
+    extent = np.ptp(spots_mm, axis=0) if len(spots_mm) else np.zeros(2)
+    field = np.maximum(area, float(extent[0] * extent[1]))
+
+    H, _ = fit.normal_equations()
+    C, _ = covariance_from_information(H, model.size_mm)
+    # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not 10⁶
+    log_prior = -np.log(field * 2 * model.size_mm * prior.rotation_volume)
+    _, logdet = np.linalg.slogdet(C)
+    volume = np.minimum(log_prior + 3 * math.log(2 * math.pi) + 0.5 * logdet, 0.0)
+
+    det_w = fit.weight[..., 0, 0] * fit.weight[..., 1, 1] - fit.weight[..., 0, 1] * fit.weight[..., 1, 0]
+    per_spot = np.where(
+        matched, math.log(P_SEEN) - math.log(2 * math.pi) + 0.5 * np.log(np.where(det_w > 0, det_w, 1)), 0
+    )
+    missed = (expected & ~matched).sum(axis=1)
+    result: FloatArray = (
+        volume
+        + per_spot.sum(axis=1)
+        - 0.5 * fit.chi2
+        + n * np.log(area)
+        + gammaln(m - n + 0.5)
+        - gammaln(m + 0.5)
+        + missed * math.log(1 - P_SEEN)
+    )
+    return np.where(np.isfinite(result), result, -np.inf)

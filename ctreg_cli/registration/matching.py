@@ -1,0 +1,588 @@
+"""Which spot is which rod, without labels: hypothesise, predict, bound λ, verify.
+
+1. *Hypothesise.* Rod triples, ordered so that a short prefix contains a triple of any large set of rods, against ordered
+   spot triples whose distances the bounded rods can show; :func:`~ctreg_cli.registration.minimal.scan_three` gives poses.
+2. *Predict.* Each pose says where every other rod crosses the slice, and how well it knows (the covariance of the three
+   spots, propagated); the nearest spot votes if it lies within that gate.
+3. *Verify.* The best-voted poses are refined on all their spots, vote again with the smaller covariance, and are ranked
+   by their odds against chance (:mod:`~ctreg_cli.registration.evidence`).
+4. *Doubt.* The winners are taken apart: one match dropped, added or swapped at a time; restarted from every root of the
+   triples of their own matches (the same matches can have a second minimum far away); and the search is run
+   again on the winners' own spots for another labelling.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.motion_field import motion_field
+from ctreg_cli.geometry.plucker import segment_distance_range
+from ctreg_cli.geometry.projection import project
+from ctreg_cli.registration.evidence import P_SEEN, PosePrior, log_odds
+from ctreg_cli.registration.minimal import RodTriples, scan_three, solve_three
+from ctreg_cli.registration.refine import (
+    Linearisation,
+    Observations,
+    covariance_from_information,
+    invert_2x2,
+    linearise,
+    refine,
+)
+from ctreg_cli.rods import RodModel
+
+#: a vote must lie within this Mahalanobis distance² of the prediction (two degrees of freedom: 1 in 30,000 lost)
+_GATE2 = 20.0
+#: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
+_WIDEST_GATE = 0.2
+#: hypotheses a stage hands on to refinement
+_KEEP_PER_TRIPLE = 48
+#: stop searching when a match beats chance by this much (ln): a rival among unrelated spots is then out of the question
+_OVERWHELMING = math.log(1e9)
+#: rivals within this many nats of the best are kept for the verdict (a good deal more than the verdict's own 100 : 1)
+_KEEP_WITHIN = 12.0
+#: spot triples examined at once, to bound memory
+_CHUNK = 40_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """Spots of one slice in slice millimetres, and what is known before looking at them."""
+
+    #: (m, 2) mm, and (m, 2, 2) mm²
+    xy_mm: FloatArray
+    covariance_mm: FloatArray
+    prior: PosePrior
+    #: how far beyond its ends a rod may still leave a spot, mm per unit of slope: half the slab
+    half_slab_mm: float = 0.0
+    #: (2, 2) lower and upper corner of the image, mm; None: unbounded
+    field_mm: FloatArray | None = None
+
+    def restricted(self, spots: IntArray) -> Scene:
+        """The scene with only these spots."""
+        return Scene(
+            xy_mm=self.xy_mm[spots],
+            covariance_mm=self.covariance_mm[spots],
+            prior=self.prior,
+            half_slab_mm=self.half_slab_mm,
+            field_mm=self.field_mm,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Matches:
+    """A stack of ``b`` refined hypotheses."""
+
+    T: FloatArray
+    #: (b, n) spot of each rod, −1 for none
+    spot_of_rod: IntArray
+    #: (b,) ln odds against chance
+    log_odds: FloatArray
+    fit: Linearisation
+    #: (b, n) rods that would have to be seen
+    expected: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.T)
+
+    def subset(self, rows: IntArray | BoolArray) -> Matches:
+        """These hypotheses only, in this order."""
+        fit = Linearisation(
+            residual_px=self.fit.residual_px[rows],
+            weight=self.fit.weight[rows],
+            jacobian=self.fit.jacobian[rows],
+            chi2=self.fit.chi2[rows],
+            lambda_mm=self.fit.lambda_mm[rows],
+            predicted_px=self.fit.predicted_px[rows],
+        )
+        return Matches(
+            T=self.T[rows],
+            spot_of_rod=self.spot_of_rod[rows],
+            log_odds=self.log_odds[rows],
+            fit=fit,
+            expected=self.expected[rows],
+        )
+
+
+def join(parts: list[Matches]) -> Matches:
+    """Stacks joined into one, best first."""
+    fit = Linearisation(
+        **{
+            name: np.concatenate([getattr(p.fit, name) for p in parts])
+            for name in ("residual_px", "weight", "jacobian", "chi2", "lambda_mm", "predicted_px")
+        }
+    )
+    joined = Matches(
+        T=np.concatenate([p.T for p in parts]),
+        spot_of_rod=np.concatenate([p.spot_of_rod for p in parts]),
+        log_odds=np.concatenate([p.log_odds for p in parts]),
+        fit=fit,
+        expected=np.concatenate([p.expected for p in parts]),
+    )
+    return joined.subset(np.argsort(-joined.log_odds, kind="stable"))
+
+
+# --- the plan of a frame: worked out once ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SearchPlan:
+    """What the search needs to know of a frame, whatever the slice."""
+
+    #: (n, n) least and greatest distance of two rods' spots, mm
+    least_mm: FloatArray
+    greatest_mm: FloatArray
+    #: (t, 3) rod triples in the order to try them
+    triples: IntArray
+    #: ``prefix[k]``: so many triples hold one of any ``k`` rods
+    prefix: dict[int, int]
+    #: (t,) how well a triple fixes a pose: geometric mean of the singular values of its motion field
+    strength: FloatArray
+
+
+@lru_cache(maxsize=16)
+def plan(model: RodModel) -> SearchPlan:
+    """Distances and the order of rod triples; cached, since a model is a value that never changes."""
+    least, greatest = segment_distance_range(model.starts, model.ends)
+    triples = np.array(list(itertools.combinations(range(len(model)), 3)), dtype=np.intp)
+    strength = _triple_strength(model, triples)
+    order, prefix = _covering_order(len(model), triples, strength)
+    return SearchPlan(
+        least_mm=least, greatest_mm=greatest, triples=triples[order], prefix=prefix, strength=strength[order]
+    )
+
+
+def _triple_strength(model: RodModel, triples: IntArray) -> FloatArray:
+    """|det J|^(1/6) of each triple's motion field, median over tilts about the frame's own axis and all heights."""
+    rng = np.random.default_rng(20081)  # a fixed design of poses, not an experiment
+    axis = np.linalg.svd(model.directions)[2][0]  # the rods' common direction, more or less
+    normal = poses.nearest_rotation(_basis_along(axis))
+    tilt = poses.exp_rotation(rng.normal(size=(48, 3)) * 0.25)
+    R = tilt @ normal
+    middle = np.concatenate([model.starts, model.ends])
+    height = np.einsum("bj,kj->bk", R[:, 2], middle - model.centre)
+    z = rng.uniform(0.2, 0.8, len(R)) * np.ptp(height, axis=1) + height.min(axis=1)
+    t = -np.einsum("bij,j->bi", R, model.centre)
+    t[:, 2] -= z
+    T = poses.make_pose(R, t)
+    J = motion_field(T, project(T, model.starts, model.directions))
+    J = np.nan_to_num(J)
+    J[..., 3:] /= model.size_mm
+    stacked = J[:, triples].reshape(len(T), len(triples), 6, 6)
+    _, logdet = np.linalg.slogdet(stacked)
+    strength: FloatArray = np.exp(np.median(np.clip(logdet, -60, 60), axis=0) / 6)
+    return strength
+
+
+def _basis_along(axis: FloatArray) -> FloatArray:
+    """A rotation whose third row is ``axis``."""
+    helper = np.eye(3)[np.abs(axis).argmin()]
+    first = np.cross(axis, helper)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis])
+
+
+def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[IntArray, dict[int, int]]:
+    """Triples ordered so that, for each k from n down to 3, a prefix holds a triple of *any* k rods (greedy cover)."""
+    chosen: list[int] = []
+    prefix: dict[int, int] = {}
+    free = np.ones(len(triples), dtype=bool)
+    for k in range(n, 2, -1):
+        if math.comb(n, k) > 20_000:  # many rods: spread the triples by strength alone
+            prefix[k] = min(len(triples), 4 * (n - k + 1))
+            for t in np.argsort(-strength, kind="stable"):
+                if len(chosen) >= prefix[k]:
+                    break
+                if free[t]:
+                    free[t] = False
+                    chosen.append(int(t))
+            continue
+        sets = np.zeros((math.comb(n, k), n), dtype=bool)
+        for row, members in enumerate(itertools.combinations(range(n), k)):
+            sets[row, list(members)] = True
+        holds = sets[:, triples].all(axis=2)  # (sets, triples)
+        open_sets: BoolArray = np.logical_not(holds[:, np.array(chosen, dtype=np.intp)].any(axis=1))
+        while open_sets.any():
+            gain = holds[open_sets].sum(axis=0) * (1e-3 + strength / strength.max()) * free
+            best = int(gain.argmax())
+            free[best] = False
+            chosen.append(best)
+            open_sets &= ~holds[:, best]
+        prefix[k] = len(chosen)
+    return np.array(chosen, dtype=np.intp), prefix
+
+
+# --- search ---------------------------------------------------------------------------------------------------------
+
+
+def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches | None:
+    """All matches worth a verdict, best first; None when no pose gathers ``least_matches`` spots."""
+    m = len(scene.xy_mm)
+    if m < least_matches:
+        return None
+    layout = plan(model)
+    found: list[Matches] = []
+    best = -np.inf
+    done = 0
+    for k in range(min(len(model), m), least_matches - 1, -1):
+        for triple in range(done, layout.prefix[k]):
+            part = _search_triple(model, scene, layout.triples[triple], least_matches)
+            if part is not None:
+                found.append(part)
+                best = max(best, float(part.log_odds.max()))
+            if best > _OVERWHELMING:
+                break
+        done = max(done, layout.prefix[k])
+        if best > _OVERWHELMING or best > _greatest_log_odds(model, scene, k - 1) + _KEEP_WITHIN:
+            break
+    if not found:
+        return None
+    pool = distinct(model, join(found))
+    return pool
+
+
+def _greatest_log_odds(model: RodModel, scene: Scene, k: int) -> float:
+    """More than any match of ``k`` spots can reach: nothing missed, no residual, spots as few as they are."""
+    variance = np.sqrt(np.linalg.det(scene.covariance_mm)).min() + float(model.tolerances.min()) ** 2
+    reach = math.pi * (1.5 * model.size_mm) ** 2
+    per_spot = math.log(P_SEEN) - math.log(2 * math.pi * variance) + math.log(reach)
+    # six of the 2k dimensions are spent on the pose: about three spots' worth
+    return (k - 3) * per_spot
+
+
+def _search_triple(model: RodModel, scene: Scene, rods: IntArray, least_matches: int) -> Matches | None:
+    """Poses from one rod triple against all spot triples, voted, refined and weighed."""
+    layout = plan(model)
+    noise = _noise_mm(model, scene)
+    kept: list[tuple[FloatArray, FloatArray, IntArray]] = []
+    for spots in _spot_triples(scene.xy_mm, layout, rods, 4 * noise):
+        T, which = scan_three(
+            RodTriples.of(model, rods),
+            scene.xy_mm[spots],
+            slack_mm=3 * noise + 2 * scene.half_slab_mm,
+            noise_mm=noise,
+        )
+        allowed = scene.prior.allows(T[:, :3, :3])
+        T, which = T[allowed], which[allowed]
+        if len(T):
+            kept.append(_vote(model, scene, T, rods, spots[which], least_matches))
+    if not kept:
+        return None
+    score, T, spot_of_rod = (np.concatenate(column) for column in zip(*kept, strict=True))
+    if len(score) == 0:
+        return None
+    top = np.argsort(-score, kind="stable")[:_KEEP_PER_TRIPLE]
+    return verify(model, scene, T[top], spot_of_rod[top], least_matches)
+
+
+def _noise_mm(model: RodModel, scene: Scene) -> float:
+    """A generous standard deviation of a spot about its rod, mm."""
+    spot = np.sqrt(np.quantile(np.trace(scene.covariance_mm, axis1=1, axis2=2) / 2, 0.8))
+    return float(math.hypot(float(spot), 1.3 * float(model.tolerances.max())))
+
+
+def _spot_triples(xy_mm: FloatArray, layout: SearchPlan, rods: IntArray, slack_mm: float) -> Iterator[IntArray]:
+    """Ordered spot triples (·, 3) whose distances these three rods can show, in chunks."""
+    gap = np.linalg.norm(xy_mm[:, None] - xy_mm[None], axis=-1)
+
+    def possible(i: int, j: int) -> BoolArray:
+        a, b = rods[i], rods[j]
+        result: BoolArray = (gap >= layout.least_mm[a, b] - slack_mm) & (gap <= layout.greatest_mm[a, b] + slack_mm)
+        np.fill_diagonal(result, False)
+        return result
+
+    ok12, ok13, ok23 = possible(0, 1), possible(0, 2), possible(1, 2)
+    rows = max(1, _CHUNK // max(1, len(xy_mm)) // max(1, int(ok23.sum(axis=1).max(initial=1))))
+    for first in range(0, len(xy_mm), rows):
+        part = slice(first, first + rows)
+        a, b, c = np.nonzero(ok12[part, :, None] & ok13[part, None, :] & ok23[None])
+        if len(a):
+            yield np.stack([a + first, b, c], axis=1)
+
+
+def _vote(
+    model: RodModel, scene: Scene, T: FloatArray, rods: IntArray, spots: IntArray, least_matches: int
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Let the spots vote on poses made from three of them; returns score, pose and spot of each rod for the best."""
+    b, n = len(T), len(model)
+    projection = project(T, model.starts, model.directions)
+    seen, expected = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
+    could = (seen | expected).sum(axis=1) >= least_matches
+    T, spots, b = T[could], spots[could], int(could.sum())
+    if b == 0:
+        return np.empty(0), np.empty((0, 4, 4)), np.empty((0, n), dtype=np.intp)
+    projection = project(T, model.starts, model.directions)
+    seen, expected = seen[could], expected[could]
+    J = np.nan_to_num(motion_field(T, projection))
+    k = np.nan_to_num(projection.slope)
+    tolerance = (model.tolerances**2)[:, None, None] * (np.eye(2) + k[..., :, None] * k[..., None, :])
+    own = tolerance[:, rods] + scene.covariance_mm[spots]
+    J_own = J[:, rods].reshape(b, 6, 6)
+    WJ = (invert_2x2(own) @ J[:, rods]).reshape(b, 6, 6)
+    size = model.size_mm
+    information = np.swapaxes(J_own, 1, 2) @ WJ + np.diag([size**-2.0] * 3 + [1.0] * 3)
+    C = np.linalg.inv(information)
+    gate = J @ C[:, None] @ np.swapaxes(J, -1, -2) + tolerance + np.median(scene.covariance_mm, axis=0)
+    xy = np.nan_to_num(projection.xy_mm, nan=1e9)
+    gap2 = ((xy[:, :, None] - scene.xy_mm[None, None]) ** 2).sum(axis=-1)
+    for column in range(3):
+        gap2[np.arange(b), :, spots[:, column]] = np.inf  # a spot of the triple votes for its own rod only
+    nearest = gap2.argmin(axis=2)
+    r = scene.xy_mm[nearest] - xy
+    distance2 = np.einsum("bni,bnij,bnj->bn", r, invert_2x2(gate), r)
+    spread = np.sqrt(np.linalg.det(gate))
+    votes = seen & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
+    votes[:, rods] = False
+    density = len(scene.xy_mm) / max(float(np.prod(np.ptp(scene.xy_mm, axis=0))), 1e-9)
+    gain = math.log(P_SEEN) - np.log(2 * math.pi * spread * density) - 0.5 * distance2
+    others = np.ones(n, dtype=bool)
+    others[rods] = False
+    score = np.where(votes, gain, np.where(expected & others, math.log(1 - P_SEEN), 0)).sum(axis=1)
+    enough = votes.sum(axis=1) + 3 >= least_matches
+    spot_of_rod = np.where(votes, nearest, -1)
+    spot_of_rod[:, rods] = spots
+    top = np.nonzero(enough)[0]
+    top = top[np.argsort(-score[top], kind="stable")[:_KEEP_PER_TRIPLE]]
+    return score[top], T[top], spot_of_rod[top]
+
+
+def visibility(
+    model: RodModel, scene: Scene, lambda_mm: FloatArray, slope: FloatArray, xy_mm: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """Which rods *may* leave a spot, and which *must* (..., n).
+
+    Between the two lie rods cut near an end, where only part of the slab holds metal; rods outside the image; and rods
+    whose crossing falls on another's, where two spots become one.
+    """
+    noise = _noise_mm(model, scene)
+    with np.errstate(invalid="ignore"):
+        per_mm = np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of rod per mm of slab
+        slack = scene.half_slab_mm * per_mm + 4 * noise * per_mm + 0.01 * model.size_mm
+        may = (lambda_mm >= -slack) & (lambda_mm <= model.lengths + slack)
+        must = (lambda_mm >= slack) & (lambda_mm <= model.lengths - slack)
+        if scene.field_mm is not None:
+            inside = ((xy_mm >= scene.field_mm[0]) & (xy_mm <= scene.field_mm[1])).all(axis=-1)
+            may &= inside
+            must &= inside
+    return may, must
+
+
+def verify(
+    model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int, rounds: int = 2
+) -> Matches | None:
+    """Refine hypotheses on their spots, let all spots vote again with the smaller covariance, refine, weigh."""
+    for _ in range(rounds):
+        T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=5, step_tolerance=1e-4)
+        spot_of_rod = assign(model, scene, T, fit)
+        enough = ((spot_of_rod >= 0).sum(axis=1) >= least_matches) & np.isfinite(fit.chi2)
+        T, spot_of_rod = T[enough], spot_of_rod[enough]
+        if len(T) == 0:
+            return None
+        _, first = np.unique(
+            np.concatenate([spot_of_rod, np.round(T[:, :3, :].reshape(len(T), -1) / 0.05).astype(np.intp)], axis=1),
+            axis=0,
+            return_index=True,
+        )
+        T, spot_of_rod = T[np.sort(first)], spot_of_rod[np.sort(first)]
+    return weigh(model, scene, T, spot_of_rod, least_matches)
+
+
+def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int) -> Matches | None:
+    """Refine hypotheses with the matches they have, and give each its odds."""
+    if len(T) == 0:
+        return None
+    T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=15, step_tolerance=1e-7)
+    projection = project(T, model.starts, model.directions)
+    may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
+    matched = spot_of_rod >= 0
+    must &= ~_merged(model, scene, fit.predicted_px, matched, must)
+    odds = log_odds(model, scene.prior, scene.xy_mm, T, fit, matched, must)
+    good = (
+        np.isfinite(odds)
+        & scene.prior.allows(T[:, :3, :3])
+        & (may | ~matched).all(axis=1)
+        & (matched.sum(axis=1) >= least_matches)
+    )
+    if not good.any():
+        return None
+    matches = Matches(T=T, spot_of_rod=spot_of_rod, log_odds=odds, fit=fit, expected=must)
+    return matches.subset(good).subset(np.argsort(-odds[good], kind="stable"))
+
+
+def _merged(model: RodModel, scene: Scene, crossing_mm: FloatArray, matched: BoolArray, must: BoolArray) -> BoolArray:
+    """Rods whose crossing falls on a matched rod's: their two spots are one, and it has been given away."""
+    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
+    reach = 2 * max(diameters) if diameters else 0.05 * model.size_mm
+    gap = np.linalg.norm(crossing_mm[:, :, None] - crossing_mm[:, None, :], axis=-1)
+    close = (gap < reach) & matched[:, None, :] & ~np.eye(len(model), dtype=bool)
+    merged: BoolArray = close.any(axis=2) & must & ~matched
+    return merged
+
+
+def observations(scene: Scene, spot_of_rod: IntArray) -> Observations:
+    """The assigned spots as the refinement wants them, in millimetres."""
+    return Observations(
+        uv_px=scene.xy_mm[spot_of_rod],
+        covariance_px=scene.covariance_mm[spot_of_rod],
+        matched=spot_of_rod >= 0,
+        mm_per_px=np.ones(2),
+    )
+
+
+def assign(model: RodModel, scene: Scene, T: FloatArray, fit: Linearisation) -> IntArray:
+    """Spot of each rod (b, n), one to one: of those within the gate, the assignment that is nearest in all (Hungarian)."""
+    H, _ = fit.normal_equations()
+    C, _ = covariance_from_information(H + np.diag([1e-6] * 6), model.size_mm)
+    projection = project(T, model.starts, model.directions)
+    may, _ = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
+    J = np.nan_to_num(motion_field(T, projection))
+    k = np.nan_to_num(projection.slope)
+    tolerance = (model.tolerances**2)[:, None, None] * (np.eye(2) + k[..., :, None] * k[..., None, :])
+    gate = J @ C[:, None] @ np.swapaxes(J, -1, -2) + tolerance
+    xy = np.nan_to_num(projection.xy_mm, nan=1e9)
+    r = scene.xy_mm[None, None] - xy[:, :, None]  # (b, n, m, 2)
+    near = (np.abs(r) < 2 * _WIDEST_GATE * model.size_mm).all(axis=-1) & may[..., None]
+    b, rod, spot = np.nonzero(near)
+    inverse = invert_2x2(gate[b, rod] + scene.covariance_mm[spot])
+    d = r[b, rod, spot]
+    distance2 = np.einsum("ki,kij,kj->k", d, inverse, d)
+    inside = distance2 < _GATE2
+    b, rod, spot, distance2 = b[inside], rod[inside], spot[inside], distance2[inside]
+    result = np.full((len(T), len(model)), -1, dtype=np.intp)
+    result[b, rod] = spot
+    by_rod = np.zeros((len(T), len(model)), dtype=np.intp)
+    np.add.at(by_rod, (b, rod), 1)
+    by_spot = np.zeros((len(T), len(scene.xy_mm)), dtype=np.intp)
+    np.add.at(by_spot, (b, spot), 1)
+    contested = np.nonzero((by_rod > 1).any(axis=1) | (by_spot > 1).any(axis=1))[0]
+    for row in contested:
+        mine = b == row
+        cost = np.full((len(model), len(scene.xy_mm)), _GATE2 * 1e3)
+        cost[rod[mine], spot[mine]] = distance2[mine]
+        i, j = linear_sum_assignment(cost)
+        take = cost[i, j] < _GATE2
+        result[row] = -1
+        result[row, i[take]] = j[take]
+    return result
+
+
+def distinct(model: RodModel, matches: Matches, *, within: float = _KEEP_WITHIN, most: int = 24) -> Matches:
+    """The best of each pose: hypotheses that are within ``within`` nats of the best and differ in pose or in matches."""
+    keep: list[int] = []
+    for i in range(len(matches)):
+        if matches.log_odds[i] < matches.log_odds[0] - within or len(keep) >= most:
+            break
+        if not any(
+            (matches.spot_of_rod[i] == matches.spot_of_rod[j]).all() and _same(model, matches.T[i], matches.T[j])
+            for j in keep
+        ):
+            keep.append(i)
+    return matches.subset(np.array(keep, dtype=np.intp))
+
+
+def _same(model: RodModel, T_a: FloatArray, T_b: FloatArray) -> bool:
+    """Equal to the last digit that matters: a thousandth of the frame's size."""
+    turn = float(poses.rotation_angle(T_a[:3, :3] @ T_b[:3, :3].T))
+    shift = float(np.linalg.norm((T_a - T_b)[:3, :3] @ model.centre + (T_a - T_b)[:3, 3]))
+    return turn < 1e-3 and shift < 1e-3 * model.size_mm
+
+
+# --- doubt ----------------------------------------------------------------------------------------------------------
+
+
+def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int = 4, most: int = 6) -> Matches:
+    """Look for what else explains the spots: other minima of the same matches, and matches that differ in one spot."""
+    pool = [matches]
+    for row in range(min(most, len(matches))):
+        if matches.log_odds[row] < matches.log_odds[0] - _KEEP_WITHIN:
+            break
+        for part in (
+            _restart(model, scene, matches, row, least_matches),
+            _vary(model, scene, matches, row, least_matches),
+        ):
+            if part is not None:
+                pool.append(part)
+    return distinct(model, join(pool))
+
+
+def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
+    """The same matches, refined from every root of their triples."""
+    spot_of_rod = matches.spot_of_rod[row]
+    matched = np.nonzero(spot_of_rod >= 0)[0]
+    triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
+    if len(triples) > 40:  # many matches: twins are rare, and each of them shows in most triples
+        triples = triples[:: len(triples) // 40 + 1]
+    noise = _noise_mm(model, scene)
+    T, _ = solve_three(
+        RodTriples.of(model, triples),
+        scene.xy_mm[spot_of_rod[triples]],
+        slack_mm=3 * noise + 2 * scene.half_slab_mm,
+        noise_mm=noise,
+    )
+    T = T[scene.prior.allows(T[:, :3, :3])]
+    if len(T) == 0:
+        return None
+    same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
+    # most of the starts are far off and say so at once
+    start = linearise(model, T, observations(scene, same))
+    T = T[np.argsort(start.chi2, kind="stable")[:60]]
+    T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=8, step_tolerance=1e-3)
+    T = T[np.argsort(fit.chi2, kind="stable")]
+    keep: list[int] = []
+    for i in range(len(T)):
+        if len(keep) >= 8:
+            break
+        if not any(
+            poses.rotation_angle(T[i, :3, :3] @ T[j, :3, :3].T) < 0.01
+            and np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]) < 0.02 * model.size_mm
+            for j in keep
+        ):
+            keep.append(i)
+    T = T[keep]
+    return weigh(model, scene, T, np.array(same[: len(T)]), least_matches)
+
+
+def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
+    """One match dropped, one free spot added, or one match exchanged, each refined anew."""
+    T, spot_of_rod = matches.T[row], matches.spot_of_rod[row]
+    matched = np.nonzero(spot_of_rod >= 0)[0]
+    starts, variants = [], []
+    without = np.repeat(spot_of_rod[None], len(matched), axis=0)
+    without[np.arange(len(matched)), matched] = -1
+    if len(matched) - 1 >= 3:
+        T_without, fit, _ = refine(
+            model,
+            np.repeat(T[None], len(matched), axis=0),
+            observations(scene, without),
+            iterations=5,
+            step_tolerance=1e-4,
+        )
+        variants.append(without)
+        starts.append(T_without)
+        again = assign(model, scene, T_without, fit)
+        variants.append(again)
+        starts.append(T_without)
+        # the spot just dropped, exchanged for the next nearest free one
+        used = np.zeros((len(matched), len(scene.xy_mm)), dtype=bool)
+        for i in range(len(matched)):
+            used[i, without[i][without[i] >= 0]] = True
+            used[i, spot_of_rod[matched[i]]] = True
+        xy = fit.predicted_px[np.arange(len(matched)), matched]
+        gap = np.linalg.norm(scene.xy_mm[None] - xy[:, None], axis=-1)
+        gap[used] = np.inf
+        swap = without.copy()
+        near = gap.min(axis=1, initial=np.inf) < _WIDEST_GATE * model.size_mm
+        swap[np.arange(len(matched)), matched] = gap.argmin(axis=1)
+        variants.append(swap[near])
+        starts.append(T_without[near])
+    variants_all = np.concatenate(variants) if variants else np.empty((0, len(model)), dtype=np.intp)
+    starts_all = np.concatenate(starts) if starts else np.empty((0, 4, 4))
+    return weigh(model, scene, starts_all, variants_all, least_matches)

@@ -1,0 +1,330 @@
+"""Three rods, three spots: every real pose (Doignon et al. 2008, §2; the generalised three-point problem with rods as rays).
+
+Three spots have three known distances, and the pose is known once the points ``P_i = p_i + λ_i y_i`` of the rods that lie
+in the slice are: ``|P_i − P_j| = d_ij``. Given λ₁, both λ₂ and λ₃ follow from quadratics,
+
+    λ_j = q_j ± √D_j,   q_j = −y_j·w_j,   D_j = q_j² − |w_j|² + d_1j²,   w_j = p_j − p_1 − λ₁ y_1,
+
+and what is left, ``F = |P₂ − P₃|² − d₂₃² = A + B σ₂√D₂ + C σ₃√D₃ + E σ₂σ₃√D₂√D₃``, is one equation in λ₁ on the bounded rod.
+The product of F over the four signs is free of roots, a polynomial of degree 8 in λ₁,
+
+    G = P² − D₂ Q²,   P = A² + B² D₂ − C² D₃ − E² D₂ D₃,   Q = 2 (A B − C E D₃).
+
+Nothing here divides by anything that vanishes for parallel rods: they only lower the degree of D.
+G is *evaluated*, not expanded. Per rod triple only three numbers (the squared distances) change from one spot triple to the
+next, so that one table over λ₁ serves all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.geometry.pose import make_pose
+from ctreg_cli.rods import RodModel
+
+#: degree of the polynomial G in λ₁
+DEGREE = 8
+_BRANCH_2 = np.array([1.0, 1.0, -1.0, -1.0])
+_BRANCH_3 = np.array([1.0, -1.0, 1.0, -1.0])
+_POLISH_STEPS = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RodTriples:
+    """Three rods for all hypotheses (g = 1), or three rods for each (g = h); λ₁ runs along the first."""
+
+    #: (g, 3, 3) starts, (g, 3, 3) unit directions, mm; (g, 3) lengths, mm
+    starts: FloatArray
+    directions: FloatArray
+    lengths: FloatArray
+
+    @classmethod
+    def of(cls, model: RodModel, rods: IntArray) -> RodTriples:
+        """The triples ``rods`` (g, 3) of a model."""
+        rods = np.atleast_2d(rods)
+        return cls(starts=model.starts[rods], directions=model.directions[rods], lengths=model.lengths[rods])
+
+    def of_hypotheses(self, hypothesis: IntArray) -> RodTriples:
+        """The triple of each of these hypotheses (itself where all share one)."""
+        if len(self.starts) == 1:
+            return self
+        return RodTriples(
+            starts=self.starts[hypothesis], directions=self.directions[hypothesis], lengths=self.lengths[hypothesis]
+        )
+
+    def quadratics(self, lambda_1: FloatArray) -> Quadratics:
+        """All that depends on λ₁ (g or h, k) but not on the distances."""
+        p, y = self.starts, self.directions
+        w = p[:, None, 1:] - p[:, None, :1] - lambda_1[..., None, None] * y[:, None, :1]  # (., k, 2, 3)
+        q = -(w * y[:, None, 1:]).sum(axis=-1)
+        D = q**2 - (w**2).sum(axis=-1)
+        g = (p[:, 1] - p[:, 2])[:, None] + q[..., 0, None] * y[:, None, 1] - q[..., 1, None] * y[:, None, 2]
+        return Quadratics(
+            q2=q[..., 0],
+            q3=q[..., 1],
+            D2=D[..., 0],
+            D3=D[..., 1],
+            A=(g**2).sum(axis=-1) + D.sum(axis=-1),
+            B=2 * (g * y[:, None, 1]).sum(axis=-1),
+            C=-2 * (g * y[:, None, 2]).sum(axis=-1),
+            E=-2 * (y[:, 1] * y[:, 2]).sum(axis=-1)[:, None],
+        )
+
+
+class Quadratics(NamedTuple):
+    """The terms of F at given λ₁; add ``d₁₂²`` to D2, ``d₁₃²`` to D3 and ``d₁₂² + d₁₃² − d₂₃²`` to A."""
+
+    q2: FloatArray
+    q3: FloatArray
+    D2: FloatArray
+    D3: FloatArray
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    E: FloatArray
+
+    def with_distances(self, d2: FloatArray) -> Quadratics:
+        """For squared distances (h, 3)."""
+        return self._replace(
+            D2=self.D2 + d2[:, 0, None],
+            D3=self.D3 + d2[:, 1, None],
+            A=self.A + (d2[:, 0] + d2[:, 1] - d2[:, 2])[:, None],
+        )
+
+
+def squared_distances(xy_mm: FloatArray) -> FloatArray:
+    """(h, 3) squared distances ``d₁₂², d₁₃², d₂₃²`` of spot triples (h, 3, 2)."""
+    gaps = xy_mm[:, [0, 0, 1]] - xy_mm[:, [1, 2, 2]]
+    result: FloatArray = (gaps**2).sum(axis=-1)
+    return result
+
+
+def solve_three(
+    triples: RodTriples, xy_mm: FloatArray, *, slack_mm: float = 0.0, noise_mm: float = 0.0
+) -> tuple[FloatArray, IntArray]:
+    """All real poses for three rods and each of ``h`` spot triples, to machine precision.
+
+    Args:
+        triples: the rods, shared by all spot triples or one row each.
+        xy_mm: (h, 3, 2) spots in slice coordinates, mm, in the order of the rods.
+        slack_mm: how far beyond a rod's ends a solution may lie.
+        noise_mm: spot noise; a pair of solutions that noise has just made complex is still returned (as one near-solution).
+
+    Returns:
+        ``T_slice_model`` (r, 4, 4) of all solutions and (r,) the spot triple each belongs to. Three parallel rods give none.
+    """
+    d2 = squared_distances(xy_mm)
+    low, high = -slack_mm, triples.lengths[:, :1] + slack_mm  # (g, 1)
+    half = (high - low) / 2
+    nodes = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+    values = _evaluate_G(triples.quadratics(low + half * (1 + nodes)).with_distances(d2))
+    values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    coefficients = values @ np.linalg.inv(chebyshev.chebvander(nodes, DEGREE)).T
+    roots = _chebyshev_roots(coefficients)  # (h, 8) complex, on [-1, 1]
+    half = np.broadcast_to(half, (len(xy_mm), 1))
+    imaginary_limit = np.maximum(1e-6 * half, np.sqrt(8 * noise_mm * half)) if noise_mm else 1e-3 * half
+    keep = (np.abs(roots.real) <= 1 + 1e-6) & (np.abs(roots.imag) * half <= imaginary_limit)
+    hypothesis, _ = np.nonzero(keep)
+    lambda_1 = low + half[hypothesis, 0] * (1 + roots.real[keep])
+    lambdas, hypothesis = _branches(triples, d2, hypothesis, lambda_1)
+    residual_mm = max(4 * noise_mm, 1e-7 * float(half.max()))
+    return _finish(triples, xy_mm, d2, hypothesis, lambdas, slack_mm, residual_mm, _POLISH_STEPS)
+
+
+def scan_three(
+    triples: RodTriples, xy_mm: FloatArray, *, slack_mm: float, noise_mm: float, samples: int = 16
+) -> tuple[FloatArray, IntArray]:
+    """Like :func:`solve_three` for tens of thousands of spot triples: sign changes and near misses of F on a grid of λ₁.
+
+    Each of the four sign choices is scanned by itself, where its roots lie far apart (those of G crowd together for parallel
+    rods at a small tilt). Beyond a fold (D < 0) F goes on with √D = 0, so that a root beside the fold still shows as a sign
+    change, and one that noise has pushed over it as a small value.
+    """
+    d2 = squared_distances(xy_mm)
+    low, high = -slack_mm, triples.lengths[:, :1] + slack_mm
+    at = low + (high - low) * np.linspace(0, 1, samples)  # (g, k)
+    terms = triples.quadratics(at).with_distances(d2)
+    at = np.broadcast_to(at, (len(xy_mm), samples))
+    blur = 8 * noise_mm * np.sqrt(d2)  # what noise does to a squared distance, generously
+    real = (-blur[:, 0, None] <= terms.D2) & (-blur[:, 1, None] <= terms.D3)
+    r2, r3 = np.sqrt(np.maximum(terms.D2, 0)), np.sqrt(np.maximum(terms.D3, 0))
+    A, Br2, Cr3, Er2r3 = terms.A, terms.B * r2, terms.C * r3, terms.E * r2 * r3
+    found = []
+    for s2, s3 in zip(_BRANCH_2, _BRANCH_3, strict=True):
+        F = A + s2 * Br2 + s3 * Cr3 + (s2 * s3) * Er2r3
+        positive = F > 0
+        crossing = (positive[:, 1:] != positive[:, :-1]) & (real[:, 1:] | real[:, :-1])
+        h, k = np.nonzero(crossing)
+        f0, f1 = F[h, k], F[h, k + 1]
+        share = f0 / (f0 - f1)
+        found.append((h, at[h, k] + share * (at[h, k + 1] - at[h, k]), s2, s3))
+        size = np.abs(F)
+        dip = real & (size <= blur.sum(axis=1)[:, None])
+        dip[:, 1:] &= size[:, 1:] <= size[:, :-1]
+        dip[:, :-1] &= size[:, :-1] <= size[:, 1:]
+        dip[:, 1:] &= ~crossing
+        dip[:, :-1] &= ~crossing
+        h, k = np.nonzero(dip)
+        found.append((h, at[h, k], s2, s3))
+    hypothesis = np.concatenate([f[0] for f in found])
+    lambda_1 = np.concatenate([f[1] for f in found])
+    s2 = np.concatenate([np.full(len(f[0]), f[2]) for f in found])
+    s3 = np.concatenate([np.full(len(f[0]), f[3]) for f in found])
+    own = triples.of_hypotheses(hypothesis)
+    terms = own.quadratics(lambda_1[:, None]).with_distances(d2[hypothesis])
+    lambda_2 = terms.q2[:, 0] + s2 * np.sqrt(np.maximum(terms.D2[:, 0], 0))
+    lambda_3 = terms.q3[:, 0] + s3 * np.sqrt(np.maximum(terms.D3[:, 0], 0))
+    lambdas = np.stack([lambda_1, lambda_2, lambda_3], axis=1)
+    # far outside on the grid is outside after polishing too
+    margin = slack_mm + (high - low) / (samples - 1)
+    margin = margin if len(margin) == 1 else margin[hypothesis]
+    near = ((lambdas >= -margin) & (lambdas <= own.lengths + margin)).all(axis=1)
+    return _finish(triples, xy_mm, d2, hypothesis[near], lambdas[near], slack_mm, max(4 * noise_mm, 1e-6), 4)
+
+
+def _evaluate_G(terms: Quadratics) -> FloatArray:
+    """G (h, k): the product of F over the four sign choices."""
+    _, _, D2, D3, A, B, C, E = terms
+    P = A * A + B**2 * D2 - (C**2 + E**2 * D2) * D3
+    Q = 2 * (A * B - (C * E) * D3)
+    G: FloatArray = P * P - D2 * (Q * Q)
+    return G
+
+
+def _chebyshev_roots(coefficients: FloatArray) -> NDArrayComplex:
+    """Eigenvalues (h, 8) of the colleague matrices of Chebyshev series (h, 9); a vanishing lead is nudged, not divided by."""
+    h, n = coefficients.shape[0], DEGREE
+    lead = coefficients[:, n]
+    tiny = 1e-14
+    lead = np.where(np.abs(lead) < tiny, np.where(lead < 0, -tiny, tiny), lead)
+    matrix = np.zeros((h, n, n))
+    i = np.arange(n - 1)
+    matrix[:, i, i + 1] = 0.5
+    matrix[:, i + 1, i] = 0.5
+    matrix[:, 0, 1] = 1.0
+    matrix[:, n - 1, :] -= 0.5 * coefficients[:, :n] / lead[:, None]
+    return np.linalg.eigvals(matrix).astype(complex)
+
+
+NDArrayComplex = np.ndarray[tuple[int, ...], np.dtype[np.complex128]]
+
+
+def _finish(
+    triples: RodTriples,
+    xy_mm: FloatArray,
+    d2: FloatArray,
+    hypothesis: IntArray,
+    lambdas: FloatArray,
+    slack_mm: float,
+    residual_mm: float,
+    steps: int,
+) -> tuple[FloatArray, IntArray]:
+    """From (r, 3) starts for the three λ to poses: polish, check the rods' ends, lay triangle on triangle."""
+    if len(hypothesis) == 0:
+        return np.empty((0, 4, 4)), np.empty(0, dtype=np.intp)
+    distance = np.sqrt(d2[hypothesis])
+    own = triples.of_hypotheses(hypothesis)
+    lambdas, error = _polish(own, lambdas, distance, steps)
+    good = error <= residual_mm
+    good &= (lambdas >= -slack_mm).all(axis=1) & (lambdas <= own.lengths + slack_mm).all(axis=1)
+    lambdas, hypothesis = lambdas[good], hypothesis[good]
+    first = _first_of_each(lambdas, hypothesis, 1e-6 * float(triples.lengths.max()))
+    lambdas, hypothesis = lambdas[first], hypothesis[first]
+    own = triples.of_hypotheses(hypothesis)
+    P = own.starts + lambdas[..., None] * own.directions
+    Q = np.concatenate([xy_mm[hypothesis], np.zeros((len(hypothesis), 3, 1))], axis=2)
+    T, valid = _lay_triangles(P, Q)
+    return T[valid], hypothesis[valid]
+
+
+def _branches(
+    triples: RodTriples, d2: FloatArray, hypothesis: IntArray, lambda_1: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """(4 r, 3) λ for all four sign choices at λ₁ (r,); the polish tells which of them were meant."""
+    terms = triples.of_hypotheses(hypothesis).quadratics(lambda_1[:, None]).with_distances(d2[hypothesis])
+    # clamped: parallel rods at a small tilt sit on the double root, where noise makes D negative
+    lambda_2 = terms.q2 + np.sqrt(np.maximum(terms.D2, 0)) * _BRANCH_2
+    lambda_3 = terms.q3 + np.sqrt(np.maximum(terms.D3, 0)) * _BRANCH_3
+    lambdas = np.stack([np.broadcast_to(lambda_1[:, None], lambda_2.shape), lambda_2, lambda_3], axis=2)
+    return lambdas.reshape(-1, 3), np.repeat(hypothesis, len(_BRANCH_2))
+
+
+def _polish(
+    triples: RodTriples, lambdas: FloatArray, distance: FloatArray, steps: int
+) -> tuple[FloatArray, FloatArray]:
+    """Damped Newton on the three distances; returns λ (r, 3) and the largest remaining distance error (r,), mm."""
+    p, y = triples.starts, triples.directions
+    i, j = np.array([0, 0, 1]), np.array([1, 2, 2])
+    size2 = float(triples.lengths.max()) ** 2
+    lam = lambdas.copy()
+    error = np.full(len(lam), np.inf)
+    for _ in range(steps):
+        P = p + lam[..., None] * y
+        gap = P[:, i] - P[:, j]
+        length = np.maximum(np.sqrt((gap**2).sum(axis=-1)), 1e-12)
+        f = length - distance
+        error = np.abs(f).max(axis=1)
+        unit = gap / length[..., None]
+        a = (unit * y[:, i]).sum(axis=-1)  # ∂f/∂λ_i
+        b = -(unit * y[:, j]).sum(axis=-1)  # ∂f/∂λ_j
+        # rows: (a0, b0, 0), (a1, 0, b1), (0, a2, b2); normal equations with a little damping, solved in closed form
+        n00 = a[:, 0] ** 2 + a[:, 1] ** 2
+        n11 = b[:, 0] ** 2 + a[:, 2] ** 2
+        n22 = b[:, 1] ** 2 + b[:, 2] ** 2
+        n01, n02, n12 = a[:, 0] * b[:, 0], a[:, 1] * b[:, 1], a[:, 2] * b[:, 2]
+        g0 = a[:, 0] * f[:, 0] + a[:, 1] * f[:, 1]
+        g1 = b[:, 0] * f[:, 0] + a[:, 2] * f[:, 2]
+        g2 = b[:, 1] * f[:, 1] + b[:, 2] * f[:, 2]
+        damping = 1e-9 + (f**2).sum(axis=1) / size2
+        n00, n11, n22 = n00 + damping, n11 + damping, n22 + damping
+        c00, c01, c02 = n11 * n22 - n12**2, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
+        det = n00 * c00 + n01 * c01 + n02 * c02
+        c11, c12, c22 = n00 * n22 - n02**2, n01 * n02 - n00 * n12, n00 * n11 - n01**2
+        step = np.stack(
+            [c00 * g0 + c01 * g1 + c02 * g2, c01 * g0 + c11 * g1 + c12 * g2, c02 * g0 + c12 * g1 + c22 * g2], 1
+        )
+        lam = lam - step / np.maximum(det, 1e-30)[:, None]
+    P = p + lam[..., None] * y
+    length = np.sqrt(((P[:, i] - P[:, j]) ** 2).sum(axis=-1))
+    return lam, np.minimum(error, np.abs(length - distance).max(axis=1))
+
+
+def _first_of_each(lambdas: FloatArray, hypothesis: IntArray, tolerance_mm: float) -> IntArray:
+    """Indices of solutions that differ: one of each (hypothesis, λ) up to the tolerance."""
+    order = np.lexsort((lambdas[:, 2], lambdas[:, 1], lambdas[:, 0], hypothesis))
+    near = np.zeros(len(order), dtype=bool)
+    for back in (1, 2, 3, 4):  # neighbours in λ₁ order; ties in λ₁ are few
+        same = (hypothesis[order[back:]] == hypothesis[order[:-back]]) & (
+            np.abs(lambdas[order[back:]] - lambdas[order[:-back]]).max(axis=1) <= tolerance_mm
+        )
+        near[back:] |= same
+    return np.sort(order[~near])
+
+
+def _lay_triangles(P: FloatArray, Q: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Rigid transforms (r, 4, 4) laying triangles ``P`` on ``Q`` (r, 3, 3), and which triangles are not degenerate."""
+    B_P, ok_P = _triangle_basis(P)
+    B_Q, ok_Q = _triangle_basis(Q)
+    R = B_Q @ np.swapaxes(B_P, 1, 2)
+    t = Q.mean(axis=1) - np.einsum("rij,rj->ri", R, P.mean(axis=1))
+    return make_pose(R, t), ok_P & ok_Q
+
+
+def _triangle_basis(P: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Right-handed orthonormal bases (r, 3, 3), columns: along side 1–2, in the plane, normal.
+
+    The in-plane angle is the mean of those of the three corners seen from the centre would be more even under noise; the
+    side is exact for exact triangles, and refinement follows.
+    """
+    a, b = P[:, 1] - P[:, 0], P[:, 2] - P[:, 0]
+    n = np.cross(a, b)
+    length_a, length_n = np.linalg.norm(a, axis=1), np.linalg.norm(n, axis=1)
+    ok = length_n > 1e-9 * np.maximum(length_a, np.linalg.norm(b, axis=1)) ** 2
+    e1 = a / np.maximum(length_a, 1e-300)[:, None]
+    e3 = n / np.maximum(length_n, 1e-300)[:, None]
+    return np.stack([e1, np.cross(e3, e1), e3], axis=2), ok

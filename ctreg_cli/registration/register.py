@@ -1,0 +1,283 @@
+"""The public door: spots of one slice and a rod model in, a verdict out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.evidence import PosePrior
+from ctreg_cli.registration.matching import Matches, Scene, doubt, observations, search
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.refine import (
+    Linearisation,
+    covariance_from_information,
+    linearise,
+    refine,
+)
+from ctreg_cli.registration.result import Candidate, Registration
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+
+#: a match is believed when its odds against chance exceed this (ln); false alarms: see benchmarks/accuracy.py
+ACCEPT_LOG_ODDS = math.log(1e4)
+#: a rival within these odds of the best makes the slice ambiguous (contract §5)
+RIVAL_ODDS = 100.0
+#: ... when its pose is farther off than this many standard deviations (contract §5)
+RIVAL_SD = 6.0
+#: a fit with a smaller χ² probability is refused
+BAD_FIT_P = 1e-4
+#: a fit with a smaller χ² probability has its standard deviations widened
+INFLATE_P = 1e-2
+#: beyond this condition number (rotation in frame sizes) the weak direction is named in a warning
+WEAK_CONDITION = 60.0
+#: matches below which nothing can be checked: three spots always fit
+LEAST_MATCHES = 4
+
+
+def pose_prior(model: RodModel, T_patient_slice: FloatArray | None, options: RegistrationOptions) -> PosePrior:
+    """The mount of the frame file as a cone of rotations model → slice."""
+    if model.mount is None or not options.use_mount:
+        return PosePrior()
+    R = np.asarray(model.mount.patient_from_model, dtype=np.float64)
+    if T_patient_slice is not None:
+        R = T_patient_slice[:3, :3].T @ R
+    return PosePrior(rotation=R, max_angle_rad=math.radians(model.mount.max_angle_deg))
+
+
+def make_scene(
+    spots: Spots,
+    model: RodModel,
+    scale: Scale,
+    *,
+    T_patient_slice: FloatArray | None = None,
+    thickness_mm: float | None = None,
+    shape: tuple[int, int] | None = None,
+    options: RegistrationOptions,
+) -> Scene:
+    """Spots in millimetres with all that bears on the pose."""
+    s = scale.mm_per_px
+    field = None
+    if shape is not None:
+        field = np.array([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]) * s
+    return Scene(
+        xy_mm=spots.uv_px * s,
+        covariance_mm=spots.covariance_px * (s[:, None] * s),
+        prior=pose_prior(model, T_patient_slice, options),
+        half_slab_mm=0.5 * thickness_mm if thickness_mm is not None else 0.0,
+        field_mm=field,
+    )
+
+
+def register(
+    spots: Spots,
+    model: RodModel,
+    *,
+    scale: Scale,
+    T_patient_slice: FloatArray | None = None,
+    thickness_mm: float | None = None,
+    shape: tuple[int, int] | None = None,
+    options: RegistrationOptions | None = None,
+) -> Registration:
+    """Pose of the frame from the unlabelled spots of one slice (Doignon et al. 2008, §2; and past it).
+
+    Args:
+        spots: spots of the slice, px.
+        model: the rods, mm.
+        scale: mm per pixel.
+        T_patient_slice: (4, 4) slice → patient, where known: the frame's ``mount`` is then taken in patient axes.
+        thickness_mm: slab thickness; a rod may leave a spot when the slab only touches it.
+        shape: (rows, columns) of the image: a rod that crosses outside it is not missed.
+        options: see :class:`RegistrationOptions`.
+
+    Returns:
+        The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²), leaves
+        no more rods unexplained than it explains, and no other pose comes within odds of 100 : 1.
+    """
+    options = options or RegistrationOptions()
+    scene = make_scene(
+        spots, model, scale, T_patient_slice=T_patient_slice, thickness_mm=thickness_mm, shape=shape, options=options
+    )
+    if len(spots) < LEAST_MATCHES:
+        return Registration(status="no_pose", reason="too_few_spots", n_spots=len(spots))
+    matches = search(model, scene, least_matches=LEAST_MATCHES)
+    if matches is None:
+        return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
+    matches = doubt(model, scene, matches, least_matches=LEAST_MATCHES)
+    return decide(model, scene, spots, scale, matches)
+
+
+def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches) -> Registration:
+    """The verdict on a slice's matches, best first."""
+    candidates = [candidate(model, scene, spots, scale, matches, row) for row in range(len(matches))]
+    best = candidates[0]
+
+    def refused(reason: str) -> Registration:
+        return Registration(status="no_pose", reason=reason, n_spots=len(spots))
+
+    if len(best.rod_index) < len(best.missing_rods):
+        return refused("no_consistent_match")
+    if best.log_odds < ACCEPT_LOG_ODDS:
+        return refused("no_consistent_match")
+    if chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P:
+        return refused("bad_fit")
+    rivals = [
+        c
+        for c in candidates[1:]
+        if c.log_odds > best.log_odds - math.log(RIVAL_ODDS) and pose_distance_sd(best, c) > RIVAL_SD
+    ]
+    warnings: list[tuple[str, str]] = []
+    widened, factor = widen_where_curved(model, scene, matches, best)
+    if widened is None:
+        return Registration(
+            status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
+        )
+    if factor > 1:
+        best = widened
+        warnings.append(("curved_cost", f"the cost is flatter than its curvature says; sd widened {factor:.2f} times"))
+    if best.inflation > 1:
+        warnings.append(
+            ("inflated", f"spots lie farther off than their sd allows; sd widened {best.inflation:.2f} times")
+        )
+    weak = weakness(model, best.covariance)
+    if weak:
+        warnings.append(("weak_geometry", weak))
+    if spots.sd_assumed:
+        warnings.append(("assumed_sd", "the spots came without sd; the covariance rests on an assumed one"))
+    if rivals:
+        chosen = _distinct_poses([best, *rivals])
+        return Registration(
+            status="ambiguous",
+            reason="rival_pose",
+            candidates=tuple(chosen),
+            n_spots=len(spots),
+            warnings=tuple(warnings),
+        )
+    return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
+
+
+def _distinct_poses(candidates: list[Candidate]) -> list[Candidate]:
+    """One of each pose, best first."""
+    kept: list[Candidate] = []
+    for c in candidates:
+        if all(pose_distance_sd(k, c) > RIVAL_SD for k in kept):
+            kept.append(c)
+    return kept
+
+
+def candidate(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches, row: int) -> Candidate:
+    """A match refined to the last digit, with its covariance, in the contract's units."""
+    spot_of_rod = matches.spot_of_rod[row : row + 1]
+    T, fit, steps = refine(model, matches.T[row : row + 1], observations(scene, spot_of_rod), iterations=30)
+    H, _ = fit.normal_equations()
+    C, _ = covariance_from_information(H[0], model.size_mm)
+    return assemble_candidate(
+        model, spots, scale, T[0], fit, spot_of_rod[0], matches.expected[row], C, float(matches.log_odds[row]), steps
+    )
+
+
+def assemble_candidate(
+    model: RodModel,
+    spots: Spots,
+    scale: Scale,
+    T: FloatArray,
+    fit: Linearisation,
+    spot_of_rod: IntArray,
+    expected: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
+    covariance: FloatArray,
+    odds: float,
+    steps: int,
+) -> Candidate:
+    """Put a one-hypothesis fit (in millimetres) into a :class:`Candidate` (in pixels)."""
+    rods = np.nonzero(spot_of_rod >= 0)[0]
+    residual = fit.residual_px[0, rods] / scale.mm_per_px
+    dof = 2 * len(rods) - 6
+    chi2 = float(fit.chi2[0])
+    inflation = 1.0
+    if dof > 0 and chi2_distribution.sf(chi2, dof) < INFLATE_P:
+        inflation = math.sqrt(chi2 / dof)
+    return Candidate(
+        T_slice_model=frozen(T, (4, 4)),
+        covariance=frozen(covariance * inflation**2, (6, 6)),
+        rod_index=frozen_index(rods),
+        spot_index=frozen_index(spot_of_rod[rods]),
+        residual_px=frozen(residual, (None, 2)),
+        lambda_mm=frozen(fit.lambda_mm[0, rods], (None,)),
+        missing_rods=frozen_index(np.nonzero(expected & (spot_of_rod < 0))[0]),
+        rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else 0.0,
+        chi2=chi2,
+        degrees_of_freedom=dof,
+        log_odds=odds,
+        inflation=inflation,
+        iterations=steps,
+    )
+
+
+def pose_distance_sd(a: Candidate, b: Candidate) -> float:
+    """How many standard deviations of ``a`` the pose of ``b`` lies away."""
+    twist = poses.difference(b.T_slice_model, a.T_slice_model)
+    return float(np.sqrt(twist @ np.linalg.pinv(a.covariance, hermitian=True) @ twist))
+
+
+def weakness(model: RodModel, covariance: FloatArray) -> str:
+    """The worst-known direction of a pose in plain words, or nothing where all are known alike."""
+    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
+    # about the frame's own centre nothing is blamed on a far-away model origin; slice axes
+    values, vectors = np.linalg.eigh(covariance * (unit[:, None] * unit))
+    if values[-1] <= WEAK_CONDITION**2 * max(float(values[0]), 1e-300):
+        return ""
+    worst = vectors[:, -1] / unit
+    sd = math.sqrt(float(values[-1]))
+    turn = np.linalg.norm(vectors[3:, -1]) > np.linalg.norm(vectors[:3, -1])
+    axis = "xyz"[int(np.abs(worst[3:] if turn else worst[:3]).argmax())]
+    if turn:
+        angle = math.degrees(sd * float(np.linalg.norm(worst[3:])))
+        kind = "rotation in the slice plane" if axis == "z" else f"tilt about {axis}"
+        return f"{kind} is known to {angle:.2g} deg only"
+    return f"position along {axis} is known to {sd:.2g} mm only"
+
+
+def widen_where_curved(
+    model: RodModel, scene: Scene, matches: Matches, best: Candidate
+) -> tuple[Candidate | None, float]:
+    """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
+
+    Returns the candidate and the factor (1 when all is well), or None when a step of 3 sd costs next to nothing: then
+    no ellipsoid describes what is known.
+    """
+    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
+    values, vectors = np.linalg.eigh(best.covariance / best.inflation**2 * (unit[:, None] * unit))
+    direction = vectors[:, -1]
+    sd = math.sqrt(max(float(values[-1]), 0.0))
+    spot_of_rod = np.full((2, len(model)), -1, dtype=np.intp)
+    spot_of_rod[:, best.rod_index] = best.spot_index
+    seen = observations(scene, spot_of_rod)
+    T0 = np.repeat(best.T_slice_model[None], 2, axis=0)
+    offset = 3 * sd * np.stack([direction, -direction])
+    T = poses.update(T0, offset / unit)
+    complement = vectors[:, :-1]
+    basis = complement / unit[:, None]
+    for _ in range(4):  # let the other five directions give way: the profile, not a cut
+        fit = linearise(model, T, seen)
+        H, g = fit.normal_equations()
+        Hc = basis.T @ H @ basis
+        step = np.linalg.solve(
+            Hc + 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None], (g @ basis)[..., None]
+        )
+        T = poses.update(T, step[..., 0] @ basis.T)
+    rise = linearise(model, T, seen).chi2 - best.chi2
+    least = float(np.min(np.where(np.isfinite(rise), rise, 9.0)))
+    if least > 0.6 * 9:
+        return best, 1.0
+    if least < 1.0:
+        return None, math.inf
+    factor = 3 / math.sqrt(least)
+    widened = (
+        best.covariance + (factor**2 - 1) * np.outer(direction / unit, direction / unit) * sd**2 * best.inflation**2
+    )
+    fields = {name: getattr(best, name) for name in Candidate.__dataclass_fields__}
+    return Candidate(**{**fields, "covariance": frozen(widened, (6, 6))}), factor
