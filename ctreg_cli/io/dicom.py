@@ -33,6 +33,7 @@ from ctreg_cli.io.dicom_pixels import (
     excess_bytes,
     is_lossy,
     locate,
+    pixel_element,
     read_layout,
     read_padding,
     read_rescale,
@@ -148,6 +149,7 @@ def _with_place(record: ImageRecord, header: Header) -> ImageRecord:
 
 def _records(path: Path, source: str, header: Header, series: SeriesKey) -> list[ImageRecord]:
     elements = header.elements
+    pixel_element(header)  # of all that is missing in a file cut short, the pixels say it best
     layout = read_layout(elements)
     info = SliceInfo(source=source, shape=(layout.rows, layout.columns), uids=_uids(elements))
     whole = _with_place(
@@ -200,6 +202,7 @@ def _classic_frames(record: ImageRecord, elements: Elements, pixels: list[Pixels
                 record,
                 info=dataclasses.replace(record.info, source=f"{record.info.source}#{k + 1}", T_patient_slice=T),
                 pixels=pixels[k],
+                frame=k + 1,
                 clock=delayed(record.clock, delays_s[k]) if delays_s else record.clock,
             )
         )
@@ -230,8 +233,8 @@ def _enhanced_frames(
     nothing = Elements({}, elements.little_endian)
     frames = []
     for k in range(layout.n_frames):
-        source = f"{whole.info.source}#{k + 1}" if layout.n_frames > 1 else whole.info.source
-        info = dataclasses.replace(whole.info, source=source)
+        number = k + 1 if layout.n_frames > 1 else 0
+        info = dataclasses.replace(whole.info, source=f"{whole.info.source}#{number}" if number else whole.info.source)
         try:
             macros = shared_macros | (_macros(own[k]) if own else {})
             measures, position, orientation, transform = (macros.get(name, elements) for name in _GEOMETRY_MACROS)
@@ -239,13 +242,14 @@ def _enhanced_frames(
             frame = dataclasses.replace(
                 whole,
                 info=_with_geometry(info, measures, position, orientation),
+                frame=number,
                 pixels=pixels[k],
                 slope=slope,
                 intercept=intercept,
                 clock=read_clock(elements, macros.get("FrameContentSequence", nothing)),
             )
         except HeaderProblem as error:
-            frame = dataclasses.replace(whole, info=info, problem=str(error))
+            frame = dataclasses.replace(whole, info=info, frame=number, problem=str(error))
         frames.append(frame)
     return frames
 

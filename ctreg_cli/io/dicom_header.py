@@ -173,7 +173,10 @@ class Elements:
             return []
         value = element.value
         if isinstance(value, bytes):
-            value = convert_SQ(value, element.is_implicit_VR, element.is_little_endian)
+            unknown = (
+                element.VR == "UN"
+            )  # whoever passed it on did not know it, and left it in implicit VR (PS3.5 6.2.2)
+            value = convert_SQ(value, element.is_implicit_VR or unknown, element.is_little_endian or unknown)
         return [Elements({e.tag: e for e in item.elements()}, self.little_endian) for item in value]
 
     def _one(self, keyword: str, value: bytes, code: str) -> int:

@@ -47,6 +47,8 @@ from ctreg_cli.io.image_record import Pixels
 
 #: the largest CT matrices are 2048 × 2048; a small file must not claim gigabytes
 MAX_PIXELS = 2**25
+#: the same for frames, each of which costs a record
+MAX_FRAMES = 2**16
 #: an encapsulated frame has an item header of its own, so a file holds no more frames than this allows
 MIN_ENCAPSULATED_FRAME_BYTES = 8
 
@@ -126,8 +128,8 @@ def read_layout(elements: Elements) -> Layout:
     if representation not in (0, 1):
         raise problem("PixelRepresentation", "is not 0 or 1")
     n_frames = elements.integer("NumberOfFrames")
-    if n_frames is not None and n_frames < 0:
-        raise problem("NumberOfFrames", "is negative")
+    if n_frames is not None and not 0 <= n_frames <= MAX_FRAMES:
+        raise problem("NumberOfFrames", f"is {n_frames}, not between 1 and {MAX_FRAMES}")
     return Layout(
         rows=rows,
         columns=columns,
@@ -175,14 +177,23 @@ def locate(path: Path, header: Header, layout: Layout) -> list[Pixels]:
     Raises:
         HeaderProblem: no pixels, a kind that cannot be decoded, or a length that does not fit Rows × Columns.
     """
-    element = header.pixels
-    if element is None:
-        raise problem("PixelData", "is missing: the file may be cut short")
+    element = pixel_element(header)
     if element.keyword != "PixelData":
         raise problem(element.keyword, "holds floating-point pixels, which no CT scanner stores")
     if header.transfer_syntax in _NATIVE:
         return _locate_native(path, header, element, layout)
     return _locate_encapsulated(path, header, element, layout)
+
+
+def pixel_element(header: Header) -> PixelElement:
+    """Where the pixels are.
+
+    Raises:
+        HeaderProblem: nowhere.
+    """
+    if header.pixels is None:
+        raise problem("PixelData", "is missing: the file may be cut short")
+    return header.pixels
 
 
 def is_lossy(header: Header) -> bool:
@@ -351,7 +362,9 @@ class EncapsulatedPixels:
                 raise UnreadableSliceError(str(error)) from None
             # the door to the decoders: a damaged codestream makes them raise whatever they like
             except Exception:  # noqa: BLE001
-                raise UnreadableSliceError(f"{tag_name('PixelData')} cannot be decoded: it is damaged") from None
+                raise UnreadableSliceError(
+                    f"{tag_name('PixelData')} cannot be decoded: damaged, or of a kind unknown to the decoders"
+                ) from None
         stored.flags.writeable = False
         return stored
 

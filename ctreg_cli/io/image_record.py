@@ -64,6 +64,8 @@ class ImageRecord:
     #: what the file says of its time, the most telling first; None where it says nothing
     clock: tuple[Instant | None, ...] = ()
     instance: int | None = None
+    #: from 1 in a multi-frame file, else 0
+    frame: int = 0
     #: one short phrase each, the same for all files with the same oddity
     notes: tuple[str, ...] = ()
 

@@ -43,6 +43,7 @@ _SAME_ORIENTATION_RAD = 1e-3
 _SHOWN_TILT_DEG = 0.1
 _MAX_SERIES_NAMED = 20
 _T = TypeVar("_T")
+NaturalKey = tuple[tuple[int, int, str], ...]
 
 NOT_AN_IMAGE = "not an image"
 NO_PIXELS = "DICOM without an image"
@@ -154,7 +155,7 @@ def _image_set(found: _Found, chosen: Sequence[_Series]) -> ImageSet:
             warnings += _remarks(group, len(found.groups) > 1)
         elif group.key.modality == "PNG" and chosen:
             skipped[PNG_BESIDE_DICOM] += len(group.records)
-            warnings.append(f"{len(group.records)} PNG files beside a DICOM series were left out")
+            warnings.append(f"{_count(len(group.records), 'PNG file')} beside a DICOM series left out")
         else:
             skipped[OTHER_SERIES] += len(group.records)
     records = [record for group in chosen for record in group.records] + found.lost
@@ -162,7 +163,9 @@ def _image_set(found: _Found, chosen: Sequence[_Series]) -> ImageSet:
         warnings.append(f"the slices come from {len(chosen)} series")
     if found.lost:
         first = found.lost[0]
-        warnings.append(f"{len(found.lost)} files cannot be read at all; {first.info.source}: {first.problem}")
+        warnings.append(
+            f"{_count(len(found.lost), 'file')} cannot be read at all; {first.info.source}: {first.problem}"
+        )
     return ImageSet(
         records=tuple(records),
         skipped=dict(skipped),
@@ -250,12 +253,13 @@ def _find(paths: Sequence[Path]) -> _Found:
     for group in by_key.values():
         _order(group)
     if not by_key and not lost:
-        raise InputError(f"{_named(paths)}: no DICOM or PNG image found; give CT slices or a folder of them")
+        seen = ", ".join(f"{count} × {reason}" for reason, count in skipped.items()) or "no files"
+        raise InputError(f"{_named(paths)}: no DICOM or PNG image found ({seen}); give CT slices or a folder of them")
     lost.sort(key=lambda record: natural_key(record.info.source))
     return _Found(groups=list(by_key.values()), lost=lost, skipped=dict(skipped))
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+def natural_key(name: str) -> NaturalKey:
     """A key that sorts ``s2.png`` before ``s10.png``."""
     parts = re.split(r"(\d+)", name)
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part.casefold()) for part in parts if part)
@@ -315,12 +319,13 @@ def _order(group: _Series) -> None:
     if not line.complete and numbered and len(set(instances)) < len(instances):
         problems.append("several slices have the same Instance Number: those are ordered by file name")
 
-    def key(place: int) -> tuple[float, float, tuple[tuple[int, int, str], ...]]:
+    def key(place: int) -> tuple[float, float, NaturalKey, int]:
         time, instance = line.times_s[place], records[place].instance
         return (
             (math.inf if time is None else time) if line.complete else 0.0,
             (math.inf if instance is None else instance) if numbered else 0.0,
             natural_key(records[place].info.source),
+            records[place].frame,
         )
 
     places = sorted(range(len(records)), key=key)
@@ -458,7 +463,7 @@ def _spacing_remarks(records: Sequence[ImageRecord]) -> list[str]:
     order = np.argsort(heights, kind="stable")
     steps = np.diff(heights[order])
     apart = steps[steps > _SAME_POSITION_MM]
-    instances = [uid for record in records if (uid := record.info.uids.get("sop_instance"))]
+    instances = [(uid, record.frame) for record in records if (uid := record.info.uids.get("sop_instance"))]
     if len(set(instances)) < len(instances):
         remarks.append("some images are there twice (same SOP Instance UID)")
     # slices that repeat a place at another time are a sequence in time, as in CT fluoroscopy: no defect
@@ -491,6 +496,10 @@ def _notes(records: Sequence[ImageRecord]) -> list[str]:
 
 
 # ---------------------------------------------------------------------------------------------------- names
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
 
 
 def _relative(file: Path, folder: Path) -> str:
