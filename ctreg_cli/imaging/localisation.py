@@ -1,0 +1,210 @@
+"""Centres of spots at the statistical bound, with covariances that own up to streaks.
+
+The profile of :mod:`ctreg_cli.imaging.profile` is fitted to all windows at once by Levenberg–Marquardt. Pixels are
+weighted by what can be wrong with them: noise everywhere, and structure of the background (streaks, plate edges) growing
+with the distance from the blob. The covariance has the same two parts: the noise seen through the estimator, and the
+structure *left over* around the blob seen through it as a correlated field. Both are measured in the window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.imaging.blob import Blobs
+from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, evaluate
+from ctreg_cli.imaging.window import dilated, grid, nan_quantile, ring
+
+#: steps of the fit; the centre settles in four (later ones move it by less than a tenth of its sd)
+ITERATIONS = 6
+#: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
+STRUCTURE_WEIGHT = 3.0
+#: correlation length of background structure, px: the width of streaks, which the same blur has made as the spots
+STRUCTURE_LENGTH_PX = 2.0
+#: how far beyond the blob's edge the structure that disturbs it is looked at, px
+STRUCTURE_REACH_PX = (1.0, 4.0)
+#: this many pixels at the image's ceiling inside one blob mean that it was cut off there
+MIN_CLIPPED_PX = 3
+#: a scanner stores whole numbers: noise is never less than rounding, in stored units
+ROUNDING_SD = float(1.0 / np.sqrt(12.0))
+#: start and width (sd) of ln β: between a Gaussian and a flat top; and the sd of the logarithms of height and size
+START_LOG_BETA = 0.15
+SD_LOG_BETA = 0.5
+SD_LOG_SHAPE = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Centres:
+    """Fitted centres of ``k`` blobs, image coordinates."""
+
+    #: (k, 2) px
+    uv_px: FloatArray
+    #: (k, 2, 2) px²
+    covariance_px: FloatArray
+    #: (k,) sd of the pixel noise about each blob, stored units
+    noise: FloatArray
+
+
+def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
+    """Fit the profile to every blob.
+
+    Where a fit runs away (more than the blob's own size from its centre of gravity), the centre of gravity is returned
+    with a covariance of the blob's size: known badly, and said so.
+
+    Args:
+        blobs: windows of one radius.
+        ceiling: value at which the image is cut off; pixels of that value are taken as "at least so bright".
+    """
+    k = len(blobs.middles)
+    u, v = (axis.ravel() for axis in grid(blobs.radius))
+    values = blobs.values.reshape(k, -1)
+    missing = np.isnan(values)
+    values = np.where(missing, blobs.background[:, None], values)
+    clipped = values >= ceiling
+    clipped &= ((clipped & blobs.own.reshape(k, -1)).sum(axis=1) >= MIN_CLIPPED_PX)[:, None]
+    distance = _distance_beyond_edge(blobs, u, v)
+    usable = ~missing & ~dilated(blobs.foreign).reshape(k, -1)
+    noise = _pixel_noise(blobs, distance, usable)
+    structure = _background_structure(blobs, noise)
+    reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
+    spread = STRUCTURE_WEIGHT * structure[:, None] * distance / reach[:, None]
+    weights = usable / (noise[:, None] ** 2 + spread**2)
+
+    start = _start(blobs, clipped)
+    parameters, residuals, jacobian, normal = _levenberg_marquardt(start, u, v, values, clipped, weights)
+
+    influence = np.linalg.inv(normal)[:, CENTRE] @ (jacobian * weights[:, None])  # (k, 2, p): d centre / d pixel
+    covariance = _seen_noise(influence, noise) + _seen_structure(influence, residuals, distance, usable, noise)
+    centre = parameters[:, CENTRE]
+    away = ((centre - blobs.centre) ** 2).sum(axis=1)
+    size = np.trace(blobs.moments, axis1=1, axis2=2)
+    lost = ~(np.isfinite(centre).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (away <= size))
+    centre = np.where(lost[:, None], blobs.centre, centre)
+    covariance = np.where(lost[:, None, None], blobs.moments, covariance)
+    return Centres(uv_px=blobs.middles + centre, covariance_px=covariance, noise=noise)
+
+
+def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Distance (k, p) of pixels outside the ellipse of the blob's half-height moments, px; 0 inside."""
+    x, y = u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None]
+    metric = np.linalg.inv(4.0 * blobs.moments)  # a uniform ellipse has moments of a quarter of its semi-axes squared
+    radius = np.sqrt(metric[:, 0, 0, None] * x * x + 2 * metric[:, 0, 1, None] * x * y + metric[:, 1, 1, None] * y * y)
+    distance: FloatArray = np.hypot(x, y) * np.maximum(0.0, 1.0 - 1.0 / np.maximum(radius, 1e-9))
+    return distance
+
+
+def _pixel_noise(blobs: Blobs, distance: FloatArray, usable: BoolArray) -> FloatArray:
+    """Sd (k,) of the noise that differs from pixel to pixel, by the Laplacian, which no gradient or wide streak moves."""
+    w = blobs.values
+    laplacian = 4 * w[:, 1:-1, 1:-1] - w[:, :-2, 1:-1] - w[:, 2:, 1:-1] - w[:, 1:-1, :-2] - w[:, 1:-1, 2:]
+    n = 2 * blobs.radius + 1
+    quiet = (usable & (distance > 2.0)).reshape(-1, n, n)[:, 1:-1, 1:-1]
+    sample = np.where(quiet, np.abs(laplacian), np.nan).reshape(len(w), -1)
+    sd = 1.4826 * nan_quantile(sample, 0.5) / np.sqrt(20.0)  # 4² + 4 · 1² = 20
+    return np.maximum(np.nan_to_num(sd), ROUNDING_SD)
+
+
+def _background_structure(blobs: Blobs, noise: FloatArray) -> FloatArray:
+    """Sd (k,) of what the ring about the blob holds beyond noise, after its best plane is taken off."""
+    u, v = grid(blobs.radius)
+    at = ring(blobs.radius)
+    values = blobs.values[:, at]
+    values = np.where(np.isnan(values), blobs.background[:, None], values)
+    plane = np.stack([np.ones(at.sum()), u[at], v[at]], axis=1)
+    left = values - (values @ np.linalg.pinv(plane).T) @ plane.T
+    spread = 1.4826 * np.median(np.abs(left), axis=1)
+    return np.sqrt(np.maximum(spread**2 - noise**2, 0.0))
+
+
+def _start(blobs: Blobs, clipped: BoolArray) -> FloatArray:
+    """First parameters (k, 10) from the blob's moments.
+
+    Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the flat
+    part covers ``log2 a / (1 + log2 a)`` of what lies above h/2.
+    """
+    k = len(blobs.middles)
+    flat = np.where(blobs.own.reshape(k, -1), clipped, False).sum(axis=1) / np.maximum(blobs.area, 1.0)
+    flat = np.minimum(flat, 0.75)
+    log2_over = np.clip(flat / (1.0 - flat), 0.1, 2.5)
+    metric = np.linalg.inv(4.0 * blobs.moments) * ((1.0 + log2_over) ** np.exp(-START_LOG_BETA))[:, None, None]
+    l_vv = np.sqrt(metric[:, 1, 1])
+    l_uv = metric[:, 0, 1] / l_vv
+    l_uu = np.sqrt(np.maximum(metric[:, 0, 0] - l_uv**2, 1e-6))
+    start = np.zeros((k, N_PARAMETERS))
+    start[:, CENTRE] = blobs.centre
+    start[:, LOG_HEIGHT] = log2_over * np.log(2.0) + np.log(blobs.height)
+    start[:, BACKGROUND] = blobs.background
+    start[:, SHAPE] = np.stack([np.log(l_uu), l_uv, np.log(l_vv)], axis=1)
+    start[:, LOG_BETA] = START_LOG_BETA
+    return start
+
+
+def _levenberg_marquardt(
+    start: FloatArray, u: FloatArray, v: FloatArray, values: FloatArray, clipped: BoolArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Parameters, residuals, Jacobian and normal matrix at the minimum of Σ w r² plus weak priors on the shape."""
+    k = len(start)
+    prior = np.zeros(N_PARAMETERS)
+    prior[SHAPE], prior[LOG_HEIGHT], prior[LOG_BETA] = 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_BETA**2
+    low, high = start - 3 * SD_LOG_SHAPE, start + 3 * SD_LOG_SHAPE
+    low[:, BACKGROUND : SHAPE.start], high[:, BACKGROUND : SHAPE.start] = -np.inf, np.inf
+    low[:, LOG_BETA], high[:, LOG_BETA] = 0.0, 1.5  # from a Gaussian to nearly a box
+    diagonal = np.arange(N_PARAMETERS)
+
+    def cost_of(residuals: FloatArray, parameters: FloatArray) -> FloatArray:
+        total: FloatArray = (weights * residuals**2).sum(axis=1) + (prior * (parameters - start) ** 2).sum(axis=1)
+        return total
+
+    parameters, damping = start, np.full(k, 1e-3)
+    residuals, jacobian = evaluate(parameters, u, v, values, clipped)
+    cost = cost_of(residuals, parameters)
+    for _ in range(ITERATIONS):
+        normal, gradient = _normal_equations(jacobian, weights, residuals)
+        normal[:, diagonal, diagonal] += prior + 1e-9
+        gradient -= prior * (parameters - start)
+        damped = normal.copy()
+        damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
+        trial = np.clip(parameters + step, low, high)
+        trial_residuals, trial_jacobian = evaluate(trial, u, v, values, clipped)
+        trial_cost = cost_of(trial_residuals, trial)
+        better = trial_cost <= cost
+        parameters = np.where(better[:, None], trial, parameters)
+        residuals = np.where(better[:, None], trial_residuals, residuals)
+        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
+        cost = np.where(better, trial_cost, cost)
+        damping *= np.where(better, 0.1, 10.0)
+    normal, _ = _normal_equations(jacobian, weights, residuals)
+    normal[:, diagonal, diagonal] += prior + 1e-9
+    return parameters, residuals, jacobian, normal
+
+
+def _normal_equations(
+    jacobian: FloatArray, weights: FloatArray, residuals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    weighted = jacobian * weights[:, None]
+    return weighted @ jacobian.transpose(0, 2, 1), (weighted @ residuals[:, :, None])[:, :, 0]
+
+
+def _seen_noise(influence: FloatArray, noise: FloatArray) -> FloatArray:
+    """Covariance (k, 2, 2) of the centre from white noise of sd ``noise``."""
+    covariance: FloatArray = influence @ influence.transpose(0, 2, 1) * noise[:, None, None] ** 2
+    return covariance
+
+
+def _seen_structure(
+    influence: FloatArray, residuals: FloatArray, distance: FloatArray, usable: BoolArray, noise: FloatArray
+) -> FloatArray:
+    """Covariance (k, 2, 2) of the centre from the structure left about the blob, as a field correlated over a streak."""
+    near = usable & (distance > STRUCTURE_REACH_PX[0]) & (distance < STRUCTURE_REACH_PX[1])
+    mean_square = (residuals**2 * near).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
+    variance = np.maximum(mean_square - noise**2, 0.0)
+    k, _, p = influence.shape
+    n = int(np.sqrt(p))
+    index = np.arange(n)
+    correlation = np.exp(-0.5 * ((index[:, None] - index) / STRUCTURE_LENGTH_PX) ** 2)
+    field = (correlation @ influence.reshape(k, 2, n, n) @ correlation).reshape(k, 2, p)
+    covariance: FloatArray = influence @ field.transpose(0, 2, 1) * variance[:, None, None]
+    return covariance

@@ -1,0 +1,100 @@
+"""Where a spot could be: local maxima that stand out of a ring about them. Cheap, generous, measured in pixels alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.imaging.blob import BACKGROUND_QUANTILE
+from ctreg_cli.imaging.window import UprightImage, nan_quantile
+
+#: side of the blocks whose least value is the first, generous background, px
+BLOCK_PX = 16
+#: samples on each ring
+RING_SAMPLES = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Peaks:
+    """``k`` local maxima."""
+
+    #: (k, 2) (column, row)
+    pixels: IntArray
+    #: (k,) smoothed peak above its surroundings, stored units
+    contrast: FloatArray
+    #: (k,) radius at which the surroundings fall to half of it, px; infinite where they never do
+    half_width: FloatArray
+
+    def take(self, which: BoolArray | IntArray) -> Peaks:
+        """Some of the peaks."""
+        return Peaks(pixels=self.pixels[which], contrast=self.contrast[which], half_width=self.half_width[which])
+
+
+def smoothed(image: NDArray[Any]) -> NDArray[Any]:
+    """Binomial 3 × 3 mean over the last two axes; the outermost pixels stay as they are, NaN count as the least value."""
+    if np.isnan(image.min(initial=0)):
+        image = np.where(np.isnan(image), np.nanmin(image, initial=np.inf), image)
+    out = image.copy()
+    rows = image[..., :-2, :] + image[..., 2:, :]
+    rows += 2 * image[..., 1:-1, :]
+    inner = rows[..., :-2] + rows[..., 2:]
+    inner += 2 * rows[..., 1:-1]
+    inner *= 1 / 16
+    out[..., 1:-1, 1:-1] = inner
+    return out
+
+
+def local_maxima(smooth: NDArray[Any]) -> BoolArray:
+    """Pixels not lower than their 8 neighbours (last two axes); of a flat top only the last in reading order."""
+    maxima = np.zeros(smooth.shape, dtype=bool)
+    inner = smooth[..., 1:-1, 1:-1]
+    result = np.ones(inner.shape, dtype=bool)
+    rows, columns = smooth.shape[-2:]
+    for dr, dc in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        neighbour = smooth[..., 1 + dr : rows - 1 + dr, 1 + dc : columns - 1 + dc]
+        result &= inner > neighbour if (dr, dc) > (0, 0) else inner >= neighbour
+    maxima[..., 1:-1, 1:-1] = result
+    return maxima
+
+
+def image_noise(image: NDArray[Any]) -> float:
+    """Sd of the pixel noise of a whole image by the median Laplacian of every fourth row; flat (clipped) air left out."""
+    inner = image[1:-1:4, 1:-1]
+    laplacian = 4 * inner - image[:-2:4, 1:-1] - image[2::4, 1:-1] - image[1:-1:4, :-2] - image[1:-1:4, 2:]
+    size = np.abs(laplacian[np.isfinite(laplacian) & (laplacian != 0)])
+    return float(1.4826 * np.median(size) / np.sqrt(20.0)) if size.size else 0.0
+
+
+def above_blocks(smooth: NDArray[Any], margin: float) -> BoolArray:
+    """Pixels more than ``margin`` above the least value of their block."""
+    rows, columns = smooth.shape
+    pad = (-rows % BLOCK_PX, -columns % BLOCK_PX)
+    padded = np.pad(smooth, ((0, pad[0]), (0, pad[1])), mode="edge") if any(pad) else smooth
+    strips = padded.reshape(-1, BLOCK_PX, padded.shape[1]).min(axis=1)
+    least = strips.reshape(len(strips), -1, BLOCK_PX).min(axis=2)
+    limit = np.repeat(np.repeat(least + smooth.dtype.type(margin), BLOCK_PX, axis=0), BLOCK_PX, axis=1)
+    above: BoolArray = smooth > limit[:rows, :columns]
+    return above
+
+
+def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_half_width: float) -> Peaks:
+    """Contrast and half width of peaks ``pixels`` (k, 2) of smoothed values ``heights`` (k,), from rings about them.
+
+    On each ring the 75th percentile counts: a plate, a streak or a long spot crosses only a smaller part of it, while an
+    edge or the inside of something large fills it. The background is the darkest ring.
+    """
+    radii = np.arange(1.0, np.ceil(max_half_width) + 4.0)
+    angles = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
+    columns = np.rint(radii[:, None] * np.cos(angles)).astype(np.intp)
+    rows = np.rint(radii[:, None] * np.sin(angles)).astype(np.intp)
+    samples = image.at(pixels[:, 1, None, None] + rows, pixels[:, 0, None, None] + columns)
+    rings = nan_quantile(samples, BACKGROUND_QUANTILE)
+    rings = np.where(np.isnan(rings), heights[:, None], rings)
+    contrast = heights - rings.min(axis=1)
+    fallen = rings < (heights - 0.5 * contrast)[:, None]
+    half_width = np.where(fallen.any(axis=1), radii[fallen.argmax(axis=1)], np.inf)
+    return Peaks(pixels=pixels, contrast=contrast, half_width=half_width)
