@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from ctreg_cli.cli.options import ModelName, Quiet
+
 if TYPE_CHECKING:
     from ctreg_cli.simulation.motion import MotionKind
 
@@ -17,100 +19,102 @@ CENTRED = "centred"
 MIN_RODS_FOR_POSE = 3
 
 
-class BodyName(StrEnum):
+class Body(StrEnum):
     """What lies beside the frame; ``auto``: a head in a large frame, an abdomen under a small one."""
 
-    AUTO = "auto"
-    ABDOMEN = "abdomen"
-    HEAD = "head"
-    NONE = "none"
+    auto = "auto"
+    abdomen = "abdomen"
+    head = "head"
+    none = "none"
 
 
 class Texture(StrEnum):
-    """How noise is correlated."""
+    """Noise correlated as filtered back-projection leaves it, or every pixel on its own."""
 
-    FBP = "fbp"
-    WHITE = "white"
-
-
-SCANNER, SCENE, MOTION = "Scanner", "Scene", "Motion"
+    fbp = "fbp"
+    white = "white"
 
 
 def simulate(
-    model: Annotated[str, typer.Option("--model", "-m", help="Frame file, or name of a shipped frame.")],
-    folder: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="New folder for the series.")],
+    model: ModelName,
+    folder: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to make for the series.", show_default=False)
+    ],
     frames: Annotated[
-        int | None, typer.Option(min=1, help=f"Slices. Default {DEFAULT_FRAMES}, or as many as the motion file has.")
+        int | None,
+        typer.Option(min=1, help="Slices.  [default: 20, or all of a motion file]", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed and options give the same bytes.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier simulated series.")] = False,
-    size: Annotated[
-        tuple[int, int], typer.Option(metavar="ROWS COLS", help="Image size, px.", rich_help_panel=SCANNER)
-    ] = (512, 512),
-    scale: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="SX SY", help="mm per pixel. Default: the frame fits.", rich_help_panel=SCANNER),
-    ] = None,
-    thickness_mm: Annotated[float, typer.Option(help="Slice thickness.", rich_help_panel=SCANNER)] = 2.5,
-    psf_mm: Annotated[float, typer.Option(help="In-plane blur, FWHM.", rich_help_panel=SCANNER)] = 1.0,
-    noise_hu: Annotated[float, typer.Option(help="Noise, standard deviation.", rich_help_panel=SCANNER)] = 15.0,
-    noise_texture: Annotated[
-        Texture, typer.Option(help="Correlated as in back-projection, or white.", rich_help_panel=SCANNER)
-    ] = Texture.FBP,
-    orientation: Annotated[
-        str,
-        typer.Option(
-            help="axial, coronal, sagittal, RX,RY,RZ (degrees from axial) or the six numbers of "
-            "ImageOrientationPatient.",
-            rich_help_panel=SCANNER,
-        ),
-    ] = "axial",
-    padding: Annotated[bool, typer.Option(help="Mark pixels outside the round view.", rich_help_panel=SCANNER)] = True,
-    metal_hu: Annotated[float, typer.Option(help="Metal before clipping.", rich_help_panel=SCENE)] = 16000.0,
-    streak_hu: Annotated[float, typer.Option(help="Depth of metal streaks.", rich_help_panel=SCENE)] = 0.0,
-    rod_mm: Annotated[float, typer.Option(help="Diameter of rods that have none.", rich_help_panel=SCENE)] = 1.0,
-    missing: Annotated[
-        list[str] | None, typer.Option(metavar="ID", help="Rod left out (repeatable).", rich_help_panel=SCENE)
-    ] = None,
-    missing_count: Annotated[
-        int, typer.Option(min=0, help="Rods left out of each slice at random.", rich_help_panel=SCENE)
-    ] = 0,
-    false_count: Annotated[
-        int, typer.Option("--false", min=0, help="False bright spots in each slice.", rich_help_panel=SCENE)
-    ] = 0,
-    body: Annotated[BodyName, typer.Option(help="What lies beside the frame.", rich_help_panel=SCENE)] = BodyName.AUTO,
-    block: Annotated[bool, typer.Option(help="Acrylic about the rods.", rich_help_panel=SCENE)] = True,
+    motion: Annotated[
+        str, typer.Option(help="How the frame moves: still, breathing, drift, jump, or a pose CSV to follow.")
+    ] = "breathing",
+    amplitude_mm: Annotated[float, typer.Option(help="Greatest displacement of the frame.")] = 6.0,
+    amplitude_deg: Annotated[float, typer.Option(help="Greatest turn of the frame.")] = 3.0,
+    period_s: Annotated[float, typer.Option(help="Length of one breath.")] = 4.0,
+    interval_s: Annotated[float, typer.Option(help="Time from slice to slice.")] = 0.5,
+    step_mm: Annotated[float, typer.Option(help="Table feed from slice to slice, along their normal.")] = 0.0,
     start: Annotated[
-        str,
-        typer.Option(help="centred, random, or a pose TX,TY,TZ,QX,QY,QZ,QW (model to slice).", rich_help_panel=MOTION),
+        str, typer.Option(help="First pose: centred, random, or TX,TY,TZ,QX,QY,QZ,QW (model to slice).")
     ] = CENTRED,
     tilt_deg: Annotated[
         tuple[float, float, float],
-        typer.Option(metavar="RX RY RZ", help="Turn of the start pose, rotation vector.", rich_help_panel=MOTION),
+        typer.Option(metavar="RX RY RZ", help="Turn of the first pose about the slice's axes (rotation vector)."),
     ] = (0.0, 0.0, 0.0),
-    motion: Annotated[
+    orientation: Annotated[
         str,
-        typer.Option(help="still, breathing, drift, jump, or a pose CSV to follow.", rich_help_panel=MOTION),
-    ] = "breathing",
-    amplitude_mm: Annotated[float, typer.Option(help="Greatest displacement.", rich_help_panel=MOTION)] = 6.0,
-    amplitude_deg: Annotated[float, typer.Option(help="Greatest turn.", rich_help_panel=MOTION)] = 3.0,
-    period_s: Annotated[float, typer.Option(help="One breath.", rich_help_panel=MOTION)] = 4.0,
-    interval_s: Annotated[float, typer.Option(help="Time between slices.", rich_help_panel=MOTION)] = 0.5,
-    step_mm: Annotated[
-        float, typer.Option(help="Table feed between slices, along their normal.", rich_help_panel=MOTION)
-    ] = 0.0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
+        typer.Option(
+            help="Slice in the patient: axial, coronal, sagittal, RX,RY,RZ (degrees away from axial), or the six "
+            "numbers of ImageOrientationPatient."
+        ),
+    ] = "axial",
+    size: Annotated[tuple[int, int], typer.Option(metavar="ROWS COLS", help="Image size.")] = (512, 512),
+    scale: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="SX SY",
+            help="Millimetres per pixel along columns and rows.  [default: the frame fits]",
+            show_default=False,
+        ),
+    ] = None,
+    thickness_mm: Annotated[float, typer.Option(help="Slice thickness.")] = 2.5,
+    psf_mm: Annotated[float, typer.Option(help="Blur in the slice, full width at half maximum.")] = 1.0,
+    noise_hu: Annotated[float, typer.Option(help="Standard deviation of the noise.")] = 15.0,
+    noise_texture: Annotated[
+        Texture, typer.Option(help="Noise as filtered back-projection leaves it, or white.")
+    ] = Texture.fbp,
+    streak_hu: Annotated[float, typer.Option(help="Depth of metal streaks; 0: none.")] = 0.0,
+    metal_hu: Annotated[float, typer.Option(help="Value of metal before the scanner clips it at 3071.")] = 16000.0,
+    rod_mm: Annotated[float, typer.Option(help="Diameter of rods whose frame file gives none.")] = 1.0,
+    missing: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROD", help="Leave this rod out; may be given several times.", show_default=False),
+    ] = None,
+    missing_count: Annotated[int, typer.Option(min=0, help="Leave so many rods out of each slice, at random.")] = 0,
+    false: Annotated[int, typer.Option("--false", min=0, help="False bright spots in each slice.")] = 0,
+    body: Annotated[Body, typer.Option(help="What lies beside the frame; auto suits its size.")] = Body.auto,
+    block: Annotated[bool, typer.Option("--block/--no-block", help="Acrylic about the rods.")] = True,
+    padding: Annotated[
+        bool, typer.Option("--padding/--no-padding", help="Mark pixels outside the round field of view as padding.")
+    ] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier simulated series.")] = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Make a DICOM CT series of a frame, with truth.csv, truth.json and truth_spots.csv.
+    """Make a DICOM CT series of a frame whose poses are known.
 
-    Example: ctreg simulate -m rod-cube-30x30x40 -o series --start random --false 5 --missing-count 1
+    DIR gets the slices, the true poses (truth.csv, truth.json) and the true spots with their rods (truth_spots.csv,
+    which ctreg pose reads too).
+
+    \b
+    Examples:
+      ctreg simulate -m rod-cube-30x30x40 -o breathing --start random
+      ctreg simulate -m leksell-g-3-panel -o scan --motion still --step-mm 2 --false 5 --missing-count 1
+      ctreg simulate -m frame.yaml -o again --motion track.csv --noise-hu 30 --streak-hu 150
     """
     from dataclasses import asdict
 
     import numpy as np
-    from rich.console import Console
-    from rich.progress import Progress
 
+    from ctreg_cli.cli.console import Talk
     from ctreg_cli.cli.simulated_series import entropy_of, write_series
     from ctreg_cli.errors import InputError
     from ctreg_cli.io.results import ResultsHeader
@@ -123,11 +127,9 @@ def simulate(
     from ctreg_cli.simulation.start import parse_orientation, start_pose
 
     rod_model = load_rod_model(model)
-    fitting: dict[str, Any] = {}
+    chosen: dict[str, Any] = {} if body is Body.auto else {"body": body.value}
     if scale is not None:
-        fitting["scale"] = Scale(s_x=scale[0], s_y=scale[1])
-    if body is not BodyName.AUTO:
-        fitting["body"] = body.value
+        chosen["scale"] = Scale(s_x=scale[0], s_y=scale[1])
     settings = suitable_settings(
         rod_model,
         size,
@@ -142,52 +144,40 @@ def simulate(
         padding=padding,
         missing=tuple(missing or ()),
         missing_count=missing_count,
-        false_count=false_count,
-        **fitting,
+        false_count=false,
+        **chosen,
     )
     R_patient_slice = parse_orientation(orientation)
     rng = np.random.default_rng(seed)
     if motion in MOTION_KINDS:
-        T_start = start_pose(start, rod_model, settings, R_patient_slice, rng)
-        T_start = displaced(T_start, rod_model.centre, np.zeros(3), np.radians(tilt_deg))
         how = MotionSettings(
             kind=cast("MotionKind", motion), amplitude_mm=amplitude_mm, amplitude_deg=amplitude_deg, period_s=period_s
         )
-        trajectory = move(T_start, rod_model.centre, slice_times(frames or DEFAULT_FRAMES, interval_s), how, rng)
+        times_s = slice_times(frames or DEFAULT_FRAMES, interval_s)
+        T_start = start_pose(start, rod_model, settings, R_patient_slice, rng)
+        T_start = displaced(T_start, rod_model.centre, np.zeros(3), np.radians(tilt_deg))
+        trajectory = move(T_start, rod_model.centre, times_s, how, rng)
     elif start != CENTRED or any(tilt_deg):
-        raise InputError(
-            "--start and --tilt-deg go with a motion by name; the poses of a motion file are used as they are"
-        )
+        raise InputError("--start and --tilt-deg cannot go with a motion file: its poses are used as they are")
     else:
         trajectory = read_motion(motion, interval_s, frames)
     trajectory = advance(trajectory, step_mm)
-    slices = simulate_series(rod_model, trajectory, settings, R_patient_slice, rng)
 
-    console = Console(stderr=True, quiet=quiet)
+    talk = Talk(quiet=quiet)
     header = ResultsHeader(
-        model=rod_model, scale=settings.scale, scale_from="simulated", options={"seed": seed, **asdict(settings)}
+        model=rod_model, scale=settings.scale, scale_from="simulation", options={"seed": seed, **asdict(settings)}
     )
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("slices", total=len(trajectory))
-        rods_seen = write_series(
-            slices,
-            folder,
-            header,
-            entropy=entropy_of(header, trajectory),
-            overwrite=overwrite,
-            on_slice=lambda _: progress.advance(task),
-        )
-    console.print(
-        f"{len(trajectory)} slices of {rod_model.name} in {folder}: {settings.shape[0]} × {settings.shape[1]} px, "
-        f"{settings.scale.s_x:g} × {settings.scale.s_y:g} mm; {min(rods_seen)} to {max(rods_seen)} rods in a slice",
-        highlight=False,
-        soft_wrap=True,
+    slices = simulate_series(rod_model, trajectory, settings, R_patient_slice, rng)
+    rods_seen = write_series(
+        talk.progress(slices, total=len(trajectory), what="slices"),
+        folder,
+        header,
+        entropy=entropy_of(header, R_patient_slice, trajectory),
+        overwrite=overwrite,
+    )
+    talk.say(
+        f"{len(trajectory)} slices of {rod_model.name} in {folder}: {size[0]} × {size[1]} px of "
+        f"{settings.scale.s_x:g} × {settings.scale.s_y:g} mm, {min(rods_seen)} to {max(rods_seen)} rods in a slice"
     )
     if min(rods_seen) < MIN_RODS_FOR_POSE:
-        console.print(
-            f"ctreg: warning: a pose needs {MIN_RODS_FOR_POSE} rods, and some slices show fewer; "
-            "change --start, --amplitude-mm or --step-mm",
-            style="yellow",
-            highlight=False,
-            soft_wrap=True,
-        )
+        talk.warn(f"some slices show fewer than {MIN_RODS_FOR_POSE} rods, too few for a pose")

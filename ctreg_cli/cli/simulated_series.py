@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from ctreg_cli._version import __version__
+from ctreg_cli.arrays import FloatArray
 from ctreg_cli.io.dicom_writer import SeriesIdentity, write_ct_slice
 from ctreg_cli.io.new_folder import new_folder
 from ctreg_cli.io.results import ResultsHeader, results_encoding
@@ -35,13 +38,11 @@ def write_series(
     *,
     entropy: str,
     overwrite: bool,
-    on_slice: Callable[[SimulatedSlice], None],
 ) -> list[int]:
     """Write ``NAME_0000.dcm …``, ``truth.csv``, ``truth.json`` and ``truth_spots.csv``; all of them or nothing.
 
     Args:
         entropy: what the pixels depend on; the UIDs are made of it.
-        on_slice: called after each slice.
 
     Returns:
         How many rods each slice shows.
@@ -64,15 +65,14 @@ def write_series(
                 pose_sinks.write(truth(index, simulated))
                 spot_sinks.write((index, simulated))
                 rods_seen.append(len(simulated.rod_index))
-                on_slice(simulated)
     return rods_seen
 
 
-def entropy_of(header: ResultsHeader, trajectory: Trajectory) -> str:
+def entropy_of(header: ResultsHeader, R_patient_slice: FloatArray, trajectory: Trajectory) -> str:
     """Text that differs whenever the images do: frame, options, poses, and the program that drew them."""
-    poses = hashlib.sha256(trajectory.T_slice_model.tobytes() + trajectory.plane_mm.tobytes()).hexdigest()
-    times = hashlib.sha256(trajectory.times_s.tobytes()).hexdigest()
-    return repr((__version__, header.model.name, header.model.sha256, sorted(header.options.items()), poses, times))
+    arrays = (R_patient_slice, trajectory.T_slice_model, trajectory.plane_mm, trajectory.times_s)
+    digests = [hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in arrays]
+    return repr((__version__, header.model.name, header.model.sha256, sorted(header.options.items()), digests))
 
 
 def _spots_encoding(model: RodModel) -> Encoding[tuple[int, SimulatedSlice]]:

@@ -18,9 +18,8 @@ from ctreg_cli.simulation.settings import ScannerSettings
 #: voxels across a cylinder's diameter, and the least and most voxels along a pixel's side
 VOXELS_PER_DIAMETER = 8
 MIN_VOXELS_PER_PIXEL, MAX_VOXELS_PER_PIXEL = 4, 16
-#: layers of voxels through the slab: enough that a tilted cylinder moves by at most two voxels from one to the next
-MIN_LAYERS, MAX_LAYERS = 8, 96
-VOXELS_PER_LAYER = 2.0
+#: layers of voxels through the slab: at least, at most, and so many while a tilted cylinder slides by its own width
+MIN_LAYERS, MAX_LAYERS, LAYERS_PER_WIDTH = 8, 96, 6
 #: the point-spread function is cut here, in standard deviations
 PSF_REACH = 4.0
 #: full width at half maximum of a Gaussian of standard deviation 1
@@ -113,8 +112,8 @@ def _mean_through_slab(cylinder: Cylinder, x: FloatArray, y: FloatArray, voxel: 
     length = float(np.linalg.norm(axis))
     direction = axis / length
     edge = float(voxel.mean())
-    slide = 2 * half * math.hypot(direction[0], direction[1]) / max(abs(direction[2]), 0.1)
-    layers = int(np.clip(math.ceil(slide / (VOXELS_PER_LAYER * edge)), MIN_LAYERS, MAX_LAYERS))
+    widths = 2 * half * math.hypot(direction[0], direction[1]) / cylinder.diameter_mm
+    layers = int(np.clip(math.ceil(LAYERS_PER_WIDTH * widths), MIN_LAYERS, MAX_LAYERS))
     thickness = 2 * half / layers
     end_edge = max(edge, thickness * abs(direction[2]))
 

@@ -20,8 +20,8 @@ from ctreg_cli.simulation.scene import (
     add_streaks,
     block_patch,
     body_hu,
-    frame_radius_mm,
     outside_view,
+    room_mm,
 )
 from ctreg_cli.simulation.settings import ScannerSettings
 
@@ -82,7 +82,7 @@ def simulate_slice(
         for i in np.flatnonzero(~absent)
     ]
 
-    image = body_hu(settings, frame_radius_mm(model)).copy()
+    image = body_hu(settings, room_mm(model, settings)).copy()
     if settings.block and (block := block_patch(model, T_slice_model, settings)) is not None:
         blend(image, block, ACRYLIC_HU)
     for cylinder in (*rods, *clutter):

@@ -20,28 +20,31 @@ from ctreg_cli.simulation.settings import ScannerSettings
 AIR_HU, FAT_HU, TISSUE_HU, ORGAN_HU, BRAIN_HU, BONE_HU, ACRYLIC_HU = -1000.0, -100.0, 40.0, 65.0, 35.0, 700.0, 120.0
 
 #: acrylic reaches this far beyond the rods; a frame larger than ``SOLID_BLOCK_MM`` is hollow, with walls this thick
-BLOCK_MARGIN_MM, WALL_MM, SOLID_BLOCK_MM = 2.5, 8.0, 100.0
+BLOCK_MARGIN_MM, WALL_MM, SOLID_BLOCK_MM = 2.5, 8.0, 150.0
+#: between the frame and the body
+BODY_GAP_MM = 5.0
 #: layers through the slab when a block is averaged
 BLOCK_LAYERS = 8
 
-#: streaks: width of the dark band between two rods, how far it reaches beyond them, and how fast rays fade, mm
-BAND_SD_MM, BAND_REACH_MM, RAY_FADE_MM, RAY_WIDTH_MM = 0.7, 25.0, 6.0, 1.5
+#: streaks: width of the dark band between two rods and where it is cut (in standard deviations), how fast streaks
+#: fade, how far they reach, and the width of a rod that has no rays in it, mm
+BAND_SD_MM, BAND_CUT_SD, RAY_FADE_MM, REACH_MM, RAY_WIDTH_MM = 0.7, 3.5, 6.0, 20.0, 1.5
 #: rays around a rod: how many turns of bright and dark, and their height as a share of the band's depth
 RAY_TURNS, RAY_SHARE = (2, 3, 5), 0.6
 
 
 @lru_cache(maxsize=4)
-def body_hu(settings: ScannerSettings, radius_mm: float) -> FloatArray:
+def body_hu(settings: ScannerSettings, room_mm: float) -> FloatArray:
     """(rows, columns) the patient without the frame, read-only.
 
     Args:
-        radius_mm: of the frame: an abdomen lies below it, a head within it.
+        room_mm: from the image's middle: an abdomen lies beyond it, a head within it.
     """
     image = np.full(settings.shape, AIR_HU)
     width, height = settings.extent_mm
     cx, cy = settings.centre_mm
     if settings.body == "abdomen":
-        top = cy + radius_mm + 5.0
+        top = cy + room_mm
         b = max((cy + 0.47 * height - top) / 2, 0.05 * height)
         a, y = min(1.7 * b, 0.45 * width), top + b
         organs = [
@@ -53,7 +56,7 @@ def body_hu(settings: ScannerSettings, radius_mm: float) -> FloatArray:
               for side in (-1, 1) for sign in (-1, 1)),
         ]  # fmt: skip
     elif settings.body == "head":
-        a, b = min(75.0, 0.6 * radius_mm), min(95.0, 0.75 * radius_mm)
+        a, b = min(75.0, room_mm), min(95.0, 1.2 * room_mm)
         organs = [
             (cx, cy, a, b, TISSUE_HU),
             (cx, cy, 0.95 * a, 0.96 * b, BONE_HU),
@@ -87,6 +90,14 @@ def frame_radius_mm(model: RodModel) -> float:
     return float(np.linalg.norm(both, axis=1).max()) + BLOCK_MARGIN_MM
 
 
+def room_mm(model: RodModel, settings: ScannerSettings) -> float:
+    """Where an abdomen begins (below the frame) or a head ends (between the rods), mm from the frame's middle."""
+    if settings.body == "abdomen":
+        return frame_radius_mm(model) + BODY_GAP_MM
+    to_rods = np.cross(model.starts - model.centre, model.directions)
+    return max(float(np.linalg.norm(to_rods, axis=1).min()) - BODY_GAP_MM - WALL_MM, BODY_GAP_MM)
+
+
 def is_large(model: RodModel) -> bool:
     """Whether a frame goes round a head; a smaller one is a solid block on a body."""
     return 2 * frame_radius_mm(model) > SOLID_BLOCK_MM
@@ -102,26 +113,20 @@ def block_patch(model: RodModel, T_slice_model: FloatArray, settings: ScannerSet
     reach = np.abs(R) @ half
     if abs(centre[2]) > reach[2] + settings.thickness_mm / 2:
         return None
-    step, sides = settings.scale.mm_per_px, np.array(settings.shape[::-1])
-    first = np.clip(np.floor((centre[:2] - reach[:2]) / step).astype(int) - 1, 0, sides)
-    last = np.clip(np.ceil((centre[:2] + reach[:2]) / step).astype(int) + 2, 0, sides)
-    if (last <= first).any():
-        return None
-
-    x, y = (np.arange(first[k], last[k]) * step[k] - centre[k] for k in (0, 1))
-    edge = float(step.mean()) + settings.psf_fwhm_mm
+    margin = settings.psf_fwhm_mm + float(settings.scale.mm_per_px.max())
+    rows, columns, x, y = _window(centre[:2] - reach[:2] - margin, centre[:2] + reach[:2] + margin, settings)
+    x, y = x - centre[0], y - centre[1]
+    edge = float(settings.scale.mm_per_px.mean()) + settings.psf_fwhm_mm
     hollow = is_large(model)
     inner = half - WALL_MM
     inner[np.abs(R[2]).argmax()] = np.inf
-    share = np.zeros((len(y), len(x)))
+    share = np.zeros((y.size, x.size))
     layers = ((np.arange(BLOCK_LAYERS) + 0.5) / BLOCK_LAYERS - 0.5) * settings.thickness_mm - centre[2]
     for z in layers:
-        q = [R[0, k] * x + (R[1, k] * y)[:, None] + R[2, k] * z for k in range(3)]
+        q = [R[0, k] * x + R[1, k] * y + R[2, k] * z for k in range(3)]
         layer = _box_share(q, half, edge)
         share += layer - _box_share(q, inner, edge) if hollow else layer
-    return Patch(
-        rows=slice(first[1], last[1]), columns=slice(first[0], last[0]), share=np.maximum(share, 0.0) / BLOCK_LAYERS
-    )
+    return Patch(rows=rows, columns=columns, share=np.maximum(share, 0.0) / BLOCK_LAYERS)
 
 
 def _box_share(q_mm: list[FloatArray], half_mm: FloatArray, edge_mm: float) -> FloatArray:
@@ -139,26 +144,47 @@ def add_streaks(
     A sketch of what metal does in filtered back-projection: two rods starve the rays through both, which leaves a dark
     band along their line; each rod alone leaves fine rays of both signs.
     """
-    if len(spots_mm) == 0 or settings.streak_hu == 0:
+    if settings.streak_hu == 0:
         return
-    step, sides = settings.scale.mm_per_px, np.array(settings.shape[::-1])
-    first = np.clip(np.floor((spots_mm.min(axis=0) - BAND_REACH_MM) / step).astype(int), 0, sides)
-    last = np.clip(np.ceil((spots_mm.max(axis=0) + BAND_REACH_MM) / step).astype(int) + 1, 0, sides)
-    x, y = np.arange(first[0], last[0]) * step[0], (np.arange(first[1], last[1]) * step[1])[:, None]
-    change = np.zeros((len(y), len(x)))
+    depth = settings.streak_hu / math.sqrt(max(len(spots_mm), 1))
     for p, q in combinations(spots_mm, 2):
         length = float(np.linalg.norm(q - p))
-        if length < BAND_SD_MM:
-            continue
-        e = (q - p) / length
-        along, across = (x - p[0]) * e[0] + (y - p[1]) * e[1], (y - p[1]) * e[0] - (x - p[0]) * e[1]
-        outside = np.maximum(np.maximum(-along, along - length), 0.0)
-        change -= np.exp(-((across / BAND_SD_MM) ** 2) / 2) * np.exp(-outside / RAY_FADE_MM) / math.sqrt(len(spots_mm))
+        if length > BAND_SD_MM:
+            _add_band(image_hu, p, (q - p) / length, length, -depth, settings)
     for p in spots_mm:
-        r, angle = np.hypot(x - p[0], y - p[1]), np.arctan2(y - p[1], x - p[0])
-        turns = sum(np.cos(2 * n * angle + rng.uniform(0, 2 * math.pi)) for n in RAY_TURNS)
-        change += RAY_SHARE * turns * np.exp(-r / RAY_FADE_MM) * np.minimum(r / RAY_WIDTH_MM, 1.0)
-    image_hu[first[1] : last[1], first[0] : last[0]] += settings.streak_hu * change
+        _add_rays(image_hu, p, RAY_SHARE * settings.streak_hu, rng.uniform(0, 2 * math.pi, len(RAY_TURNS)), settings)
+
+
+def _add_band(
+    image_hu: FloatArray, p: FloatArray, e: FloatArray, length: float, hu: float, settings: ScannerSettings
+) -> None:
+    """A band from ``p`` (mm) along the unit vector ``e``, fading beyond its ends."""
+    q = p + length * e
+    rows, columns, x, y = _window(np.minimum(p, q) - REACH_MM, np.maximum(p, q) + REACH_MM, settings)
+    along = (x - p[0]) * e[0] + (y - p[1]) * e[1]
+    across = (y - p[1]) * e[0] - (x - p[0]) * e[1]
+    beyond = np.maximum(np.maximum(-along, along - length), 0)
+    near = (np.abs(across) < BAND_CUT_SD * BAND_SD_MM) & (beyond < REACH_MM)
+    fall = (across[near] / BAND_SD_MM) ** 2 / 2 + beyond[near] / RAY_FADE_MM
+    image_hu[rows, columns][near] += hu * np.exp(-fall)
+
+
+def _add_rays(image_hu: FloatArray, p: FloatArray, hu: float, phases: FloatArray, settings: ScannerSettings) -> None:
+    rows, columns, x, y = _window(p - REACH_MM, p + REACH_MM, settings)
+    r, angle = np.hypot(x - p[0], y - p[1]), np.arctan2(y - p[1], x - p[0])
+    turns = sum(np.cos(2 * n * angle + phase) for n, phase in zip(RAY_TURNS, phases, strict=True))
+    image_hu[rows, columns] += hu * turns * np.exp(-r / RAY_FADE_MM) * np.minimum(r / RAY_WIDTH_MM, 1.0)
+
+
+def _window(
+    low_mm: FloatArray, high_mm: FloatArray, settings: ScannerSettings
+) -> tuple[slice, slice, FloatArray, FloatArray]:
+    """Rows and columns of a rectangle cut at the image's edges, and the x (1, c) and y (r, 1) of its pixels, mm."""
+    step, sides = settings.scale.mm_per_px, np.array(settings.shape[::-1])
+    first = np.clip(np.floor(low_mm / step).astype(int), 0, sides)
+    last = np.clip(np.ceil(high_mm / step).astype(int) + 1, 0, sides)
+    x, y = (np.arange(first[k], last[k]) * step[k] for k in (0, 1))
+    return slice(first[1], last[1]), slice(first[0], last[0]), x[None, :], y[:, None]
 
 
 def add_noise(image_hu: FloatArray, settings: ScannerSettings, rng: np.random.Generator) -> None:
