@@ -10,7 +10,16 @@ from pydantic import Field
 
 from ctreg_cli.errors import CalibrationFileError
 from ctreg_cli.io.atomic import write_text
-from ctreg_cli.io.yaml_document import EmptyIsNone, Number, StrictSchema, Text, Whole, read_document
+from ctreg_cli.io.yaml_document import (
+    Count,
+    EmptyIsNone,
+    Name,
+    NotNegative,
+    Positive,
+    StrictSchema,
+    Text,
+    read_document,
+)
 from ctreg_cli.registration.calibrate import Calibration
 from ctreg_cli.scale import Scale
 
@@ -18,24 +27,24 @@ SCHEMA = "ctreg/calibration/1"
 
 
 class _Nominal(StrictSchema):
-    s_x_mm: Number = Field(gt=0, description="DICOM's mm per pixel along u")
-    s_y_mm: Number = Field(gt=0, description="DICOM's mm per pixel along v")
+    s_x_mm: Positive = Field(description="DICOM's mm per pixel along u")
+    s_y_mm: Positive = Field(description="DICOM's mm per pixel along v")
 
 
 class _Model(StrictSchema):
-    name: Text = Field(description="name of the frame")
+    name: Name = Field(description="name of the frame")
     sha256: Annotated[Text | None, EmptyIsNone] = Field(default=None, description="of the frame file")
 
 
 class _CalibrationFile(StrictSchema):
     schema_: Literal["ctreg/calibration/1"] = Field(alias="schema", description=f"'{SCHEMA}'")
-    s_x_mm: Number = Field(gt=0, description="mm per pixel along u (columns)")
-    s_y_mm: Number = Field(gt=0, description="mm per pixel along v (rows)")
-    sd_s_x_mm: Number = Field(ge=0, description="standard deviation of s_x_mm")
-    sd_s_y_mm: Number = Field(ge=0, description="standard deviation of s_y_mm")
-    n_slices: Whole = Field(ge=0, description="slices used")
-    n_spots: Whole = Field(ge=0, description="matched spots used")
-    rms_px: Number = Field(ge=0, description="rms residual, px")
+    s_x_mm: Positive = Field(description="mm per pixel along u (columns)")
+    s_y_mm: Positive = Field(description="mm per pixel along v (rows)")
+    sd_s_x_mm: NotNegative = Field(description="standard deviation of s_x_mm")
+    sd_s_y_mm: NotNegative = Field(description="standard deviation of s_y_mm")
+    n_slices: Count = Field(description="slices used")
+    n_spots: Count = Field(description="matched spots used")
+    rms_px: NotNegative = Field(description="rms residual, px")
     nominal: Annotated[_Nominal | None, EmptyIsNone] = Field(
         default=None, description="s_x_mm, s_y_mm from DICOM, or null"
     )

@@ -17,9 +17,12 @@ from ctreg_cli.errors import RodModelError
 from ctreg_cli.geometry.pose import nearest_rotation
 from ctreg_cli.io.atomic import write_text
 from ctreg_cli.io.yaml_document import (
+    AsNumber,
     EmptyIsNone,
     Mistake,
-    Number,
+    Name,
+    NotNegative,
+    Positive,
     StrictSchema,
     Text,
     describe,
@@ -36,7 +39,8 @@ MIN_LENGTH = 1e-6
 #: how far a written rotation may be from a true one, element by element: three decimals are enough to write
 ROTATION_TOLERANCE = 2e-3
 
-Coordinate = Annotated[Number, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE), AsNumber]
+Tilt = Annotated[float, Field(gt=0, le=180), AsNumber]
 Vector = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 
 
@@ -54,47 +58,45 @@ def _rotation(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
-class _Rod(StrictSchema):
-    id: Text = Field(description="name of the rod, e.g. r1", min_length=1)
+class RodEntry(StrictSchema):
+    id: Name = Field(description="name of the rod, e.g. r1")
     start: Vector = Field(description="[x, y, z], where lambda = 0")
     end: Vector = Field(description="[x, y, z], the other end")
-    diameter: Annotated[Number | None, EmptyIsNone] = Field(default=None, gt=0, description="of the rod")
-    tolerance: Annotated[Number | None, EmptyIsNone] = Field(
-        default=None, ge=0, description="sd of this rod's true place about the written one, across the rod"
+    diameter: Annotated[Positive | None, EmptyIsNone] = Field(default=None, description="of the rod")
+    tolerance: Annotated[NotNegative | None, EmptyIsNone] = Field(
+        default=None, description="sd of this rod's true place about the written one, across the rod"
     )
 
     @model_validator(mode="after")
-    def _has_length(self) -> _Rod:
+    def _has_length(self) -> RodEntry:
         if np.linalg.norm(np.subtract(self.end, self.start)) <= MIN_LENGTH:
             raise ValueError(f"rod {self.id} has no length: start and end are the same point")
         return self
 
 
-class _Mount(StrictSchema):
+class MountEntry(StrictSchema):
     patient_from_model: Annotated[list[Vector], Field(min_length=3, max_length=3), AfterValidator(_rotation)] = Field(
         description="rotation, three rows: model axes -> patient axes (LPS), or slice axes where there is no patient"
     )
-    max_angle_deg: Number = Field(default=45.0, gt=0, le=180, description="largest tilt from it that can occur")
+    max_angle_deg: Tilt = Field(default=45.0, description="largest tilt from it that can occur")
 
 
-class _Target(StrictSchema):
-    id: Text = Field(description="name of the target", min_length=1)
+class TargetEntry(StrictSchema):
+    id: Name = Field(description="name of the target")
     point: Vector = Field(description="[x, y, z]")
 
 
-class _FrameFile(StrictSchema):
+class FrameFile(StrictSchema):
     """Rods of a frame: what stands where. Lengths in ``units``."""
 
     schema_: Literal["ctreg/frame/1"] = Field(alias="schema", description=f"'{SCHEMA}'")
-    name: Text = Field(description="name of the frame", min_length=1)
+    name: Name = Field(description="name of the frame")
     description: Annotated[Text | None, EmptyIsNone] = Field(default=None, description="free text")
     units: Literal["mm", "cm", "m"] = Field(default="mm", description="of every length in this file")
-    rods: list[_Rod] = Field(description="at least 3", json_schema_extra={"minItems": MIN_RODS})
-    tolerance: Number = Field(
-        default=0.0, ge=0, description="sd of a rod's true place about the written one, across it"
-    )
-    mount: Annotated[_Mount | None, EmptyIsNone] = Field(default=None, description="how the frame normally sits")
-    targets: list[_Target] = Field(default=[], description="points at which accuracy is reported")
+    rods: list[RodEntry] = Field(description="at least 3", json_schema_extra={"minItems": MIN_RODS})
+    tolerance: NotNegative = Field(default=0.0, description="sd of a rod's true place about the written one, across it")
+    mount: Annotated[MountEntry | None, EmptyIsNone] = Field(default=None, description="how the frame normally sits")
+    targets: list[TargetEntry] = Field(default=[], description="points at which accuracy is reported")
 
 
 def load_rod_model(name_or_path: str | Path) -> RodModel:
@@ -107,7 +109,7 @@ def load_rod_model(name_or_path: str | Path) -> RodModel:
     """
     path = _resolve(name_or_path)
     document = read_document(path, RodModelError)
-    file = document.validate(_FrameFile, _file_checks)
+    file = document.validate(FrameFile, _file_checks)
     mm = MM_PER_UNIT[file.units]
     return RodModel(
         name=file.name,
@@ -169,7 +171,7 @@ def frame_schema() -> dict[str, Any]:
     """JSON Schema of a frame file, for editors that check while one types."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **_FrameFile.model_json_schema(),
+        **FrameFile.model_json_schema(),
         "title": f"ctreg frame file ({SCHEMA})",
     }
 
@@ -198,7 +200,7 @@ def _resolve(name_or_path: str | Path) -> Path:
     raise RodModelError(f"{name}: neither a file nor a shipped frame; {hint} (shipped: {', '.join(shipped)})")
 
 
-def _mount(mount: _Mount) -> Mount:
+def _mount(mount: MountEntry) -> Mount:
     written = np.array(mount.patient_from_model)
     nearest = nearest_rotation(written)
     exact = written if np.allclose(written, nearest, rtol=0, atol=1e-12) else nearest

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from ctreg_cli.errors import InputError
@@ -87,10 +87,14 @@ def _empty_is_none(value: object) -> object:
     return None if isinstance(value, Scalar) and not value.quoted and value in {"", "~", "null"} else value
 
 
-#: field types of a schema: read from the text as written
-Number = Annotated[float, BeforeValidator(_number)]
-Whole = Annotated[int, BeforeValidator(_whole)]
+#: field types of a schema, read from the text as written; constraints stand inside, where JSON Schema sees them
+AsNumber = BeforeValidator(_number)
+Number = Annotated[float, AsNumber]
+Positive = Annotated[float, Field(gt=0), AsNumber]
+NotNegative = Annotated[float, Field(ge=0), AsNumber]
+Count = Annotated[int, Field(ge=0), BeforeValidator(_whole)]
 Text = Annotated[str, BeforeValidator(_text)]
+Name = Annotated[str, Field(min_length=1), BeforeValidator(_text)]
 #: put before ``X | None``: ``key:`` and ``key: null`` mean the same as leaving it out
 EmptyIsNone = BeforeValidator(_empty_is_none)
 

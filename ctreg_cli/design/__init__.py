@@ -1,0 +1,1 @@
+"""Is a frame good for poses? Degenerate sets, symmetries and the accuracy to expect, before anything is built."""
