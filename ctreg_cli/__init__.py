@@ -7,7 +7,7 @@
     model = ct.load_rod_model("frame.yaml")
     for slice_ in ct.read_slices("slices/"):
         spots = ct.find_spots(slice_)
-        result = ct.register(spots, model, slice_.info.scale)
+        result = ct.register(spots, model, scale=slice_.info.scale)
 
 Names are loaded when first used: ``import ctreg_cli`` costs nothing.
 """

@@ -21,11 +21,8 @@ class AtomicFile:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        check_folder(self.path)
         target = self.path.resolve()
-        if target.is_dir():
-            raise InputError(f"{path}: is a folder; name a file")
-        if not target.parent.is_dir():
-            raise InputError(f"{path}: folder {self.path.parent} does not exist; make it first")
         self._target = target
         self._direct = target.exists() and not target.is_file()
         self._partial = target if self._direct else target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -54,6 +51,18 @@ class AtomicFile:
         self.stream.close()
         if not self._direct:
             self._partial.unlink(missing_ok=True)
+
+
+def check_folder(path: Path) -> None:
+    """A file of this name could be made, as far as folders are concerned.
+
+    Raises:
+        InputError: no such folder, or the name is a folder.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file")
+    if not path.resolve().parent.is_dir():
+        raise InputError(f"{path}: folder {path.parent} does not exist; make it first")
 
 
 def write_text(path: str | Path, text: str) -> None:

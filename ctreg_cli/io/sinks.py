@@ -20,7 +20,7 @@ from typing import Any, Generic, Protocol, Self, TextIO, TypeVar
 import numpy as np
 
 from ctreg_cli.errors import InputError
-from ctreg_cli.io.atomic import AtomicFile
+from ctreg_cli.io.atomic import AtomicFile, check_folder
 
 Item = TypeVar("Item", contravariant=True)
 
@@ -157,10 +157,11 @@ class JsonLinesFile(Generic[Item]):
 
     def __init__(self, path: Path, encoding: Encoding[Item]) -> None:
         self._encoding = encoding
-        if not path.resolve().parent.is_dir():
-            raise InputError(f"{path}: folder {path.parent} does not exist; make it first")
+        check_folder(path)
+        self._path, self._is_new = path, not path.exists()
         try:
-            self._stream = path.open("w", encoding="utf-8", newline="")
+            # not "w": an earlier file stays until there is something to put in its place
+            self._stream = path.open("a", encoding="utf-8", newline="")
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror})") from error
         self._started = False
@@ -171,6 +172,8 @@ class JsonLinesFile(Generic[Item]):
 
     def _start(self, item: Item | None) -> None:
         if not self._started:
+            if self._stream.seekable():
+                self._stream.truncate(0)
             self._line(self._encoding.header(item))
             self._started = True
 
@@ -185,6 +188,8 @@ class JsonLinesFile(Generic[Item]):
     def abandon(self) -> None:
         """The lines written are whole and stay."""
         self._stream.close()
+        if self._is_new and not self._started:
+            self._path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -267,21 +272,33 @@ def format_of(output: str) -> str:
     return suffix
 
 
+def check_outputs(outputs: Sequence[str] | None) -> list[str]:
+    """The values of ``-o``, ``-`` when there are none; to be called before any work is done.
+
+    Raises:
+        InputError: an unknown suffix, the same output twice, or a folder that does not exist.
+    """
+    outputs = list(outputs or [STANDARD_OUTPUT])
+    for output in outputs:
+        format_of(output)
+    files = [Path(output) for output in outputs if output != STANDARD_OUTPUT]
+    for file in files:
+        check_folder(file)
+    if len({file.resolve() for file in files}) < len(files) or outputs.count(STANDARD_OUTPUT) > 1:
+        raise InputError(f"-o {' -o '.join(outputs)}: the same output twice")
+    return outputs
+
+
 def open_sinks(outputs: Sequence[str], encoding: Encoding[Item], standard_output: TextIO) -> Sinks[Item]:
     """Sinks for the values of ``-o``; none means CSV on ``standard_output``.
 
     Raises:
-        InputError: an unknown suffix, the same output twice, or a place that cannot be written; then nothing is left.
+        InputError: as :func:`check_outputs`, or a place that cannot be written; then nothing is left.
     """
-    outputs = list(outputs) or [STANDARD_OUTPUT]
-    places = [output if output == STANDARD_OUTPUT else str(Path(output).resolve()) for output in outputs]
-    if len(set(places)) < len(places):
-        raise InputError(f"-o {' -o '.join(outputs)}: the same output twice")
-    kinds = [format_of(output) for output in outputs]
     sinks: list[Sink[Item]] = []
     try:
-        for output, kind in zip(outputs, kinds, strict=True):
-            sinks.append(_open(output, kind, encoding, standard_output))
+        for output in check_outputs(outputs):
+            sinks.append(_open(output, format_of(output), encoding, standard_output))
     except InputError:
         for sink in sinks:
             sink.abandon()

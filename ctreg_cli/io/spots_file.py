@@ -137,11 +137,19 @@ def read_spots(path: str | Path, *, spot_sd_px: float = DEFAULT_SPOT_SD_PX) -> l
     Raises:
         SpotsFileError: one line a mistake, ``file:line: column: what is wrong, what is allowed``.
     """
+    return parse_spots(read_bytes(path), str(path), spot_sd_px=spot_sd_px)[0]
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Content of a spots file.
+
+    Raises:
+        SpotsFileError: it cannot be read.
+    """
     try:
-        content = Path(path).read_bytes()
+        return Path(path).read_bytes()
     except OSError as error:
         raise SpotsFileError(f"{path}: cannot be read ({error.strerror})") from error
-    return parse_spots(content, str(path), spot_sd_px=spot_sd_px)[0]
 
 
 def parse_spots(

@@ -1,0 +1,151 @@
+"""Options that mean the same in several commands, written down once."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
+
+
+class Polarity(StrEnum):
+    """What a rod looks like in the image."""
+
+    bright = "bright"
+    dark = "dark"
+    auto = "auto"
+
+
+class Jacobian(StrEnum):
+    """When the tracker renews its motion field."""
+
+    updated = "updated"
+    constant = "constant"
+
+
+def _positive(value: float | None) -> float | None:
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise typer.BadParameter(f"{value:g} is not a positive number")
+    return value
+
+
+def _gain(value: float) -> float:
+    if not 0 < value <= 1:
+        raise typer.BadParameter(f"{value:g} is not in 0 < G <= 1")
+    return value
+
+
+def _probability(value: float) -> float:
+    if not 0 < value < 1:
+        raise typer.BadParameter(f"{value:g} is not a probability between 0 and 1")
+    return value
+
+
+Inputs = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="INPUT",
+        help="DICOM or PNG files, folders of them, or one spots file (.csv, .json, .jsonl; - is standard input).",
+        show_default=False,
+    ),
+]
+ModelName = Annotated[
+    str,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="FRAME",
+        help="Frame file, or name of a shipped frame (ctreg model list).",
+        show_default=False,
+    ),
+]
+Outputs = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="Where to write: .csv, .json or .jsonl by suffix, - for CSV on standard output; may be given several "
+        "times.  [default: -]",
+        show_default=False,
+    ),
+]
+CalibrationFile = Annotated[
+    str | None,
+    typer.Option(
+        "--calibration",
+        "-c",
+        metavar="FILE",
+        help="Pixel scale from ctreg calibrate; overrides DICOM PixelSpacing.",
+        show_default=False,
+    ),
+]
+ScalePair = Annotated[
+    tuple[float, float] | None,
+    typer.Option(
+        "--scale",
+        metavar="SX SY",
+        help="Millimetres per pixel along columns and rows; overrides all others.",
+        show_default=False,
+    ),
+]
+SeriesNumber = Annotated[
+    int | None,
+    typer.Option("--series", metavar="N", help="Which DICOM series, by its number in ctreg info.", show_default=False),
+]
+SpotSd = Annotated[
+    float | None,
+    typer.Option(
+        "--spot-sd",
+        metavar="PX",
+        callback=_positive,
+        show_default=False,
+        help="Standard deviation of spots that come without one.  [default: 0.25]",
+    ),
+]
+PolarityChoice = Annotated[
+    Polarity, typer.Option("--polarity", help="Rods brighter (CT) or darker than what is around them; auto tries both.")
+]
+OverlayFolder = Annotated[
+    str | None,
+    typer.Option("--overlay", metavar="DIR", help="Also draw what was found, one PNG a slice.", show_default=False),
+]
+WithUids = Annotated[bool, typer.Option("--with-uids", help="Put the DICOM UIDs into JSON outputs.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit code 1 when any slice failed.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Explain every slice.")]
+UseMount = Annotated[
+    bool, typer.Option("--mount/--no-mount", help="Obey what the frame file says about how the frame sits.")
+]
+IntegrityRisk = Annotated[
+    float,
+    typer.Option(
+        "--integrity-risk",
+        metavar="P",
+        callback=_probability,
+        help="Accepted chance, a slice, that the true error exceeds the protection level.",
+    ),
+]
+AlertLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--alert-limit",
+        metavar="MM",
+        callback=_positive,
+        show_default=False,
+        help="Refuse a pose whose protection level at any target exceeds this.",
+    ),
+]
+JacobianChoice = Annotated[
+    Jacobian, typer.Option("--jacobian", help="Motion field renewed at every step, or kept from the last registration.")
+]
+Gain = Annotated[
+    float,
+    typer.Option("--gain", metavar="G", callback=_gain, help="Share of the spot error taken back a step, 0 < G <= 1."),
+]
+
+REGISTRATION = RegistrationOptions()
+TRACKING = TrackingOptions()

@@ -1,0 +1,100 @@
+"""The body that ``pose`` and ``track`` share: slices to results, files, pictures and a closing table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+
+from ctreg_cli.cli.console import Talk
+from ctreg_cli.cli.options import Polarity
+from ctreg_cli.cli.overlays import OverlayWriter
+from ctreg_cli.cli.run import Watched, choose_scale, close, consume, open_inputs
+from ctreg_cli.cli.summary import PoseTally
+from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding
+from ctreg_cli.io.rod_file import load_rod_model
+from ctreg_cli.io.sinks import check_outputs, open_sinks
+from ctreg_cli.pipeline import FrameResult
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+
+#: the part in which the two commands differ: slices, frame, scale and segmentation in, results out
+Estimate = Callable[[Watched, RodModel, Scale | None, SegmentationOptions], Iterator[FrameResult]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseArguments:
+    """What both commands are told on the command line."""
+
+    inputs: list[str]
+    model: str
+    calibration: str | None
+    scale: tuple[float, float] | None
+    output: list[str] | None
+    polarity: Polarity
+    series: int | None
+    spot_sd: float | None
+    overlay: str | None
+    with_uids: bool
+    strict: bool
+    quiet: bool
+    verbose: bool
+
+
+def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], arguments: PoseArguments) -> None:
+    """Write a result for every slice, then tell how it went.
+
+    Args:
+        command: its name, for the record and the progress bar.
+        estimate: the method.
+        options: its options as resolved, for the record.
+        arguments: the rest of the command line.
+
+    Raises:
+        CtregError: the model, the input, the scale or an output cannot be used.
+        typer.Exit: code 1 when not one slice gave a pose, or with ``strict`` when any slice is not ``ok``.
+    """
+    talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose)
+    outputs = check_outputs(arguments.output)
+    model = load_rod_model(arguments.model)
+    source = open_inputs(arguments.inputs, talk, series=arguments.series, spot_sd_px=arguments.spot_sd)
+    scale = choose_scale(arguments.scale, arguments.calibration, source, model, talk)
+    segmentation = SegmentationOptions(polarity=arguments.polarity.value)
+    overlays = None
+    if arguments.overlay:
+        overlays = OverlayWriter(arguments.overlay, source, model=model, scale=scale.scale)
+    header = ResultsHeader(
+        model=model,
+        scale=scale.scale,
+        scale_from=scale.origin,
+        options={"command": command, **options, "segmentation": asdict(segmentation)},
+    )
+    sinks = open_sinks(outputs, results_encoding(header, with_uids=arguments.with_uids), sys.stdout)
+    watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
+
+    def on_result(result: FrameResult) -> None:
+        tally.add(result)
+        slice_ = watched.answered()
+        if overlays and slice_:
+            overlays.draw_result(slice_, result)
+        if talk.verbose:
+            _explain(result, talk)
+
+    results = estimate(watched, model, scale.scale, segmentation)
+    try:
+        consume(results, sinks, on_result, talk, total=len(source), what=command)
+    finally:
+        if tally.total:
+            talk.table(tally.rows())
+    close(n_good=tally.n_poses, n_failed=tally.total - tally.n_ok, strict=arguments.strict)
+
+
+def _explain(result: FrameResult, talk: Talk) -> None:
+    """One slice in a line, and its warnings in one each."""
+    words = f"slice {result.index} ({result.info.source}): {result.status} {result.reason}".rstrip()
+    for best in accepted(result)[:1]:
+        words += f", {len(best.rod_index)} of {len(result.spots)} spots matched, {best.rms_px:.3g} px rms"
+    talk.explain(words)
+    for code, text in result.warnings:
+        talk.explain(f"  {code}: {text}")

@@ -1,0 +1,136 @@
+"""What the commands do alike: open slices, agree on the scale, let results pass, close with an exit code."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import typer
+
+from ctreg_cli.cli.console import Talk
+from ctreg_cli.cli.summary import counted
+from ctreg_cli.imaging.slice import Slice
+from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
+from ctreg_cli.io.sinks import Sinks
+from ctreg_cli.io.sources import Source, open_sources
+from ctreg_cli.pipeline import SliceLike
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+
+Result = TypeVar("Result")
+
+#: finished, but without what was asked for
+EXIT_NOTHING_FOUND = 1
+#: broken slices named one by one; the rest are counted
+MAX_NAMED = 10
+
+
+def open_inputs(inputs: list[str], talk: Talk, *, series: int | None, spot_sd_px: float | None) -> Source:
+    """The slices, with what was noticed on the way told.
+
+    Raises:
+        InputError: see :func:`ctreg_cli.io.sources.open_sources`.
+    """
+    source = open_sources(inputs, series=series, spot_sd_px=spot_sd_px or DEFAULT_SPOT_SD_PX)
+    for warning in source.warnings:
+        talk.warn(warning)
+    if source.skipped:
+        talk.say(f"skipped: {counted(source.skipped)}")
+    return source
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaleChoice:
+    """The scale for every slice (None: each slice's own), and where it is from."""
+
+    scale: Scale | None
+    origin: str
+
+
+def choose_scale(
+    pair: tuple[float, float] | None, calibration: str | None, source: Source, model: RodModel, talk: Talk
+) -> ScaleChoice:
+    """``--scale`` before ``-c`` before what the slices say.
+
+    Raises:
+        InputError: a scale that is none.
+        CalibrationFileError: the calibration file is wrong.
+    """
+    if pair is not None:
+        if calibration is not None:
+            talk.warn(f"--scale overrides -c {calibration}")
+        return ScaleChoice(scale=Scale(s_x=pair[0], s_y=pair[1]), origin="option")
+    if calibration is not None:
+        from ctreg_cli.io.calibration_file import load_calibration
+
+        found = load_calibration(calibration)
+        if found.model_sha256 != model.sha256:
+            talk.warn(f"{calibration} was made with another frame file ({found.model_name}) than {model.name} here")
+        return ScaleChoice(scale=found.scale, origin="calibration")
+    return ScaleChoice(scale=None, origin="dicom" if source.kind == "images" else "spots")
+
+
+@dataclass(slots=True)
+class Watched:
+    """Slices on their way into the pipeline: broken ones are named, and those not yet answered can be looked at."""
+
+    source: Source
+    talk: Talk
+    waiting: deque[SliceLike] = field(default_factory=deque)
+    n_broken: int = 0
+
+    def __iter__(self) -> Iterator[SliceLike]:
+        for item in self.source:
+            problem = getattr(item, "problem", "")
+            if problem:
+                self.n_broken += 1
+                if self.n_broken <= MAX_NAMED:
+                    self.talk.warn(f"{item.info.source}: {problem}")
+            self.waiting.append(item)
+            yield item
+        if self.n_broken > MAX_NAMED:
+            self.talk.warn(f"... and {self.n_broken - MAX_NAMED} more slices that could not be read")
+
+    def answered(self) -> Slice | None:
+        """The slice whose result has just come, if it has pixels."""
+        item = self.waiting.popleft()
+        return item if isinstance(item, Slice) else None
+
+
+def consume(
+    results: Iterable[Result],
+    sinks: Sinks[Result],
+    on_result: Callable[[Result], None],
+    talk: Talk,
+    *,
+    total: int,
+    what: str,
+) -> None:
+    """Pass every result on; stop early only when nobody reads any more (``| head``).
+
+    An interrupt (Ctrl-C) goes through after what was finished has been written.
+    """
+    done = 0
+    try:
+        with sinks:
+            for result in talk.progress(results, total=total, what=what):
+                sinks.write(result)
+                on_result(result)
+                done += 1
+                if not sinks.alive:
+                    return
+    except KeyboardInterrupt:
+        talk.say(f"interrupted: {done} of {total} slices are written")
+        raise
+
+
+def close(*, n_good: int, n_failed: int, strict: bool) -> None:
+    """End with the exit code of the contract.
+
+    Raises:
+        typer.Exit: code 1 when no slice was good, or with ``strict`` when any failed.
+    """
+    if not n_good or (strict and n_failed):
+        raise typer.Exit(EXIT_NOTHING_FOUND)

@@ -1,0 +1,109 @@
+"""The closing words of a run: how many slices, with what outcome, how well, and on what scale."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ctreg_cli.io.results import accepted
+from ctreg_cli.pipeline import FrameResult, SpotSlice
+from ctreg_cli.registration.result import Candidate
+from ctreg_cli.scale import Scale
+
+SCALE_SOURCES = {
+    "dicom": "DICOM PixelSpacing",
+    "spots": "the spots file",
+    "calibration": "the calibration file",
+    "option": "--scale",
+}
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """``3 too_few_spots, 1 unreadable``: the most frequent first."""
+    ranked = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+    return ", ".join(f"{count} {word}" for word, count in ranked)
+
+
+@dataclass(slots=True)
+class PoseTally:
+    """Outcomes of a run; a few numbers a slice, whatever its pixels."""
+
+    #: the scale given for all slices, if one was, and where scales are from
+    scale: Scale | None
+    scale_from: str
+    scales: set[Scale] = field(default_factory=set)
+    outcomes: Counter[str] = field(default_factory=Counter)
+    warnings: Counter[str] = field(default_factory=Counter)
+    rms_px: list[float] = field(default_factory=list)
+    sd_mm: list[float] = field(default_factory=list)
+    sd_deg: list[float] = field(default_factory=list)
+    total: int = 0
+    n_ok: int = 0
+    n_poses: int = 0
+
+    def add(self, result: FrameResult) -> None:
+        self.total += 1
+        scale = self.scale or result.info.scale
+        if scale:
+            self.scales.add(scale)
+        self.n_ok += result.status == "ok"
+        reason = f" ({result.reason})" if result.reason else ""
+        self.outcomes[f"{result.status}{reason}"] += 1
+        self.warnings.update({code for code, _ in result.warnings})
+        for best in accepted(result)[:1]:
+            self.n_poses += 1
+            translation, rotation = _sd(best)
+            self.rms_px.append(best.rms_px)
+            self.sd_mm.append(translation)
+            self.sd_deg.append(rotation)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Names and values for the table."""
+        rows = [("slices", str(self.total)), ("status", counted(self.outcomes))]
+        if self.n_poses:
+            rows.append(("residual", f"{statistics.median(self.rms_px):.3g} px rms"))
+            sds = f"{statistics.median(self.sd_mm):.2g} mm, {statistics.median(self.sd_deg):.2g}°"
+            rows.append(("sd", f"{sds} (largest axis)"))
+        if len(self.scales) == 1:
+            (scale,) = self.scales
+            rows.append(("scale", f"{scale.s_x:.6g} × {scale.s_y:.6g} mm/px, from {SCALE_SOURCES[self.scale_from]}"))
+        elif self.scales:
+            rows.append(("scale", f"{len(self.scales)} different ones, from {SCALE_SOURCES[self.scale_from]}"))
+        if self.warnings:
+            rows.append(("warnings", counted(self.warnings)))
+        return rows
+
+
+def _sd(candidate: Candidate) -> tuple[float, float]:
+    """Largest standard deviation over the axes: translation in mm, rotation in degrees."""
+    variance = candidate.covariance.diagonal()
+    return math.sqrt(float(variance[:3].max())), math.degrees(math.sqrt(float(variance[3:].max())))
+
+
+@dataclass(slots=True)
+class SpotTally:
+    """What a segmentation found."""
+
+    counts: list[int] = field(default_factory=list)
+    rejected: Counter[str] = field(default_factory=Counter)
+    n_unreadable: int = 0
+
+    def add(self, spot_slice: SpotSlice) -> None:
+        self.counts.append(len(spot_slice.spots))
+        self.n_unreadable += bool(spot_slice.problem)
+        self.rejected.update(spot.reason for spot in spot_slice.spots.rejected)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Names and values for the table."""
+        rows = [("slices", str(len(self.counts)))]
+        if self.counts:
+            median = statistics.median(self.counts)
+            rows.append(("spots", f"{sum(self.counts)} ({min(self.counts)} to {max(self.counts)}, median {median:g})"))
+        if self.n_unreadable:
+            rows.append(("unreadable", str(self.n_unreadable)))
+        if self.rejected:
+            rows.append(("left out", counted(self.rejected)))
+        return rows

@@ -1,0 +1,67 @@
+"""``ctreg track``: the frame followed through slices taken one after the other."""
+
+from __future__ import annotations
+
+from ctreg_cli.cli import options as opt
+
+
+def track(
+    inputs: opt.Inputs,
+    model: opt.ModelName,
+    calibration: opt.CalibrationFile = None,
+    scale: opt.ScalePair = None,
+    output: opt.Outputs = None,
+    jacobian: opt.JacobianChoice = opt.Jacobian.updated,
+    gain: opt.Gain = opt.TRACKING.gain,
+    use_mount: opt.UseMount = opt.REGISTRATION.use_mount,
+    integrity_risk: opt.IntegrityRisk = opt.REGISTRATION.integrity_risk,
+    alert_limit: opt.AlertLimit = opt.REGISTRATION.alert_limit_mm,
+    polarity: opt.PolarityChoice = opt.Polarity.bright,
+    series: opt.SeriesNumber = None,
+    spot_sd: opt.SpotSd = None,
+    overlay: opt.OverlayFolder = None,
+    with_uids: opt.WithUids = False,
+    strict: opt.Strict = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:
+    """Follow the frame through the slices as one sequence in time.
+
+    The pose of one slice predicts the next; a frame that is lost is said to be lost and looked for anew, never filled
+    in with the last pose.
+
+    \b
+    Examples:
+      ctreg track slices/ -m frame.yaml -o track.csv
+      ctreg track slices/ -m frame.yaml -c calibration.yaml --jacobian constant --gain 0.5 -o track.jsonl
+    """
+    from dataclasses import asdict
+
+    from ctreg_cli import pipeline
+    from ctreg_cli.cli.poses import PoseArguments, run_poses
+    from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
+
+    registration = RegistrationOptions(use_mount=use_mount, integrity_risk=integrity_risk, alert_limit_mm=alert_limit)
+    tracking = TrackingOptions(registration=registration, jacobian=jacobian.value, gain=gain)
+    run_poses(
+        "track",
+        lambda slices, frame, mm_per_px, segmentation: pipeline.track(
+            slices, frame, scale=mm_per_px, options=tracking, segmentation=segmentation
+        ),
+        {"tracking": asdict(tracking)},
+        PoseArguments(
+            inputs=inputs,
+            model=model,
+            calibration=calibration,
+            scale=scale,
+            output=output,
+            polarity=polarity,
+            series=series,
+            spot_sd=spot_sd,
+            overlay=overlay,
+            with_uids=with_uids,
+            strict=strict,
+            quiet=quiet,
+            verbose=verbose,
+        ),
+    )
