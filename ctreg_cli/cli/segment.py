@@ -31,7 +31,6 @@ def segment(
     from dataclasses import asdict
 
     from ctreg_cli.cli.console import Talk
-    from ctreg_cli.cli.overlays import OverlayWriter
     from ctreg_cli.cli.run import Watched, close, consume, open_inputs
     from ctreg_cli.cli.summary import SpotTally
     from ctreg_cli.imaging.segmentation import SegmentationOptions
@@ -44,7 +43,11 @@ def segment(
     outputs = check_outputs(output)
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     segmentation = SegmentationOptions(polarity=polarity.value)
-    overlays = OverlayWriter(overlay, source) if overlay else None
+    overlays = None
+    if overlay:
+        from ctreg_cli.cli.overlays import OverlayWriter
+
+        overlays = OverlayWriter(overlay, source)
     encoding = spots_encoding(options={"command": "segment", **asdict(segmentation)}, with_uids=with_uids)
     sinks = open_sinks(outputs, encoding, sys.stdout)
     watched, tally = Watched(source, talk), SpotTally()

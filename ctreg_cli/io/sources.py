@@ -10,7 +10,6 @@ from typing import Literal, Protocol
 
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
-from ctreg_cli.io.spots_file import parse_spots, read_bytes
 from ctreg_cli.pipeline import SliceLike
 
 STANDARD_INPUT = "-"
@@ -65,6 +64,9 @@ def open_sources(inputs: Sequence[str], *, series: int | None = None, spot_sd_px
     (name,) = inputs
     if series is not None:
         raise InputError(f"--series {series}: a spots file holds one series; leave it out")
+    from ctreg_cli.io.spots_file import read_bytes
+    from ctreg_cli.io.spots_parsing import parse_spots
+
     content, shown = (_standard_input(), "standard input") if name == STANDARD_INPUT else (read_bytes(name), name)
     slices, warnings = parse_spots(content, shown, spot_sd_px=spot_sd_px)
     return Source(slices=slices, kind="spots", warnings=warnings)

@@ -14,8 +14,6 @@ from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.pipeline import SpotSlice
 from ctreg_cli.scale import Scale
 
-SCHEMA = "ctreg/spots/1"
-
 #: a place beyond this (px) is no place in an image
 MAX_COORDINATE_PX = 1e6
 #: a standard deviation below this (px) is no measurement, but would outweigh every other spot
