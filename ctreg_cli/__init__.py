@@ -34,13 +34,14 @@ if TYPE_CHECKING:
     )
     from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
     from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
+    from ctreg_cli.imaging.spot_slice import SpotSlice
     from ctreg_cli.imaging.spots import Spots
     from ctreg_cli.io.calibration_file import load_calibration
     from ctreg_cli.io.images import read_slices
     from ctreg_cli.io.results import read_results, write_results
     from ctreg_cli.io.rod_file import load_rod_model
     from ctreg_cli.io.spots_file import read_spots
-    from ctreg_cli.pipeline import FrameResult, SpotSlice, pose, segment, track
+    from ctreg_cli.pipeline import FrameResult, pose, segment, track
     from ctreg_cli.registration.calibrate import Calibration, calibrate
     from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
     from ctreg_cli.registration.register import register
@@ -71,7 +72,7 @@ _HOME = {
     "SingularGeometryError": "errors",
     "Slice": "imaging.slice",
     "SliceInfo": "imaging.slice",
-    "SpotSlice": "pipeline",
+    "SpotSlice": "imaging.spot_slice",
     "Spots": "imaging.spots",
     "SpotsFileError": "errors",
     "Target": "rods",

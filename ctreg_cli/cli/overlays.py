@@ -10,9 +10,10 @@ import numpy as np
 from ctreg_cli.errors import InputError
 from ctreg_cli.geometry.projection import project, to_pixels
 from ctreg_cli.imaging.slice import Slice
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.io.results import accepted
 from ctreg_cli.io.sources import Source
-from ctreg_cli.pipeline import FrameResult, SpotSlice
+from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 

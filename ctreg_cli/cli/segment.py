@@ -34,9 +34,9 @@ def segment(
     from ctreg_cli.cli.run import Watched, close, consume, open_inputs
     from ctreg_cli.cli.summary import SpotTally
     from ctreg_cli.imaging.segmentation import SegmentationOptions
+    from ctreg_cli.imaging.spot_slice import SpotSlice
     from ctreg_cli.io.sinks import check_outputs, open_sinks
     from ctreg_cli.io.spots_file import numbered, spots_encoding
-    from ctreg_cli.pipeline import SpotSlice
     from ctreg_cli.pipeline import segment as segment_slices
 
     talk = Talk(quiet=quiet, verbose=verbose)

@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.io.results import accepted
-from ctreg_cli.pipeline import FrameResult, SpotSlice
+from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.scale import Scale
 

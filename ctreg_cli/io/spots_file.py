@@ -14,9 +14,9 @@ import numpy as np
 
 from ctreg_cli._version import __version__
 from ctreg_cli.errors import SpotsFileError
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX, Spots
 from ctreg_cli.io.sinks import Encoding
-from ctreg_cli.pipeline import SpotSlice
 
 SCHEMA = "ctreg/spots/1"
 

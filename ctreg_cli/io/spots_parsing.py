@@ -1,4 +1,4 @@
-"""Reading spots files: from text, table or document, to records at their lines, and every mistake named at its place."""
+"""Reading spots files: text to records at their lines, table or document, every mistake named at its place."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from ctreg_cli.errors import SpotsFileError
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.spots_file import COLUMNS, SCHEMA
 from ctreg_cli.io.spots_schema import SliceRecord, SpotsDocument
-from ctreg_cli.pipeline import SpotSlice
 
 NEEDED = ("slice", "u_px", "v_px")
 #: what is the same in every line of a slice

@@ -10,8 +10,8 @@ from pydantic_core import PydanticCustomError
 
 from ctreg_cli.geometry.pose import is_pose
 from ctreg_cli.imaging.slice import SliceInfo
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
-from ctreg_cli.pipeline import SpotSlice
 from ctreg_cli.scale import Scale
 
 #: a place beyond this (px) is no place in an image

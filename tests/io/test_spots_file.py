@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from ctreg_cli.errors import SpotsFileError
 from ctreg_cli.imaging.slice import SliceInfo
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.io.sinks import open_sinks
 from ctreg_cli.io.spots_file import numbered, read_spots, spots_encoding
 from ctreg_cli.io.spots_parsing import parse_spots
-from ctreg_cli.pipeline import SpotSlice
 from ctreg_cli.scale import Scale
 
 MIRROR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
