@@ -16,26 +16,13 @@ from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
+from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SpotSlice:
-    """The spots of one slice with what is known of the slice: what a spots file holds, and what segmentation makes.
-
-    ``problem`` is set (and ``spots`` empty) where the slice could not be read.
-    """
-
-    info: SliceInfo
-    spots: Spots
-    problem: str = ""
-    #: the slice's number where a spots file gave one (it may have gaps); None: its place in the sequence
-    index: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,7 +177,7 @@ def frame_result(
 def target_accuracy(model: RodModel, best: Candidate, T_patient_slice: FloatArray | None) -> tuple[TargetAccuracy, ...]:
     """Where the frame's targets are, and the predicted rms error there (TRE), from the pose covariance.
 
-    ``δP = V + Ω × (R p)``, so that cov(P) = G C Gᵀ with ``G = [I₃ | −[R p]ₓ]``. The size of the residual says nothing of it.
+    ``δP = V + Ω × (R p)``, so that cov(P) = G C Gᵀ with ``G = [I₃ | −[R p]ₓ]``. The residual says nothing of it.
     """
     result = []
     T = best.T_slice_model

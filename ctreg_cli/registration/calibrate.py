@@ -1,10 +1,44 @@
-"""Pixel scales from slices of a known frame."""
+"""Pixel scales from slices of a known frame: labels unknown, scales unknown (Doignon et al. 2008, §2, eq. 6).
+
+One slice bounds a scale to about a percent, so all slices are solved jointly: shared s_x and s_y, one pose each, and where
+the frame has a ``tolerance``, one shared displacement a rod. Labels come from the matcher, which wants a scale: DICOM's
+PixelSpacing is tried first, and where there is none or it does not fit, a logarithmic grid over every scale a scanner has.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.errors import CalibrationError
+from ctreg_cli.imaging.spot_slice import SpotSlice
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.matching import doubt, search
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.refine import Observations, ScaleFit, refine_scales
+from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, BAD_FIT_P, INFLATE_P, make_scene, register
+from ctreg_cli.registration.result import Registration
+from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+
+#: scales a scanner may have, mm per pixel
+SCALE_RANGE = (0.1, 2.0)
+#: step of the search over scales; the extra spot noise allows for half of it
+_GRID_STEP = 1.04
+#: pixels need not be square: aspect ratios s_x / s_y tried, the likeliest first
+_ASPECTS = (1.0, 1 / 1.08, 1.08, 1 / 1.17, 1.17, 1 / 1.26, 1.26)
+#: relative scale error allowed for while labels are looked for
+_SLACK_NOMINAL, _SLACK_GRID, _SLACK_FITTED = 0.01, 0.025, 0.004
+#: matched spots below which one slice says nothing of two scales and a pose
+_LEAST_SPOTS = 5
+#: slices used to find the first scale; the others confirm it
+_FIRST_SLICES = 3
+_ROUNDS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,3 +57,243 @@ class Calibration:
     nominal: Scale | None
     model_name: str
     model_sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CalibrationRun:
+    """A calibration and the poses that came with it."""
+
+    calibration: Calibration
+    #: place in the input of each slice used
+    used: tuple[int, ...]
+    #: (b, 4, 4) poses of the slices used, and (b, 6, 6) their covariances with the uncertain scale in them
+    T_slice_model: FloatArray
+    covariance: FloatArray
+    #: why each slice that was not used was not, by place
+    left_out: dict[int, str]
+    #: factor by which the standard deviations were widened because the spots were worse than believed
+    inflation: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Labelled:
+    """A slice whose spots have rods."""
+
+    place: int
+    T: FloatArray
+    #: (n,) spot of each rod, −1 for none
+    spot_of_rod: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    log_odds: float
+
+
+def calibrate(
+    slices: Sequence[SpotSlice], model: RodModel, *, options: RegistrationOptions | None = None
+) -> CalibrationRun:
+    """Estimate s_x and s_y with standard deviations from one or many slices.
+
+    Args:
+        slices: the spots of each slice; their own scale, where they have one, only narrows the search.
+        model: the rods.
+        options: see :class:`RegistrationOptions`.
+
+    Raises:
+        CalibrationError: no scale between 0.1 and 2 mm/px explains the spots; the sentence says what was missing.
+    """
+    options = options or RegistrationOptions()
+    usable = [place for place, item in enumerate(slices) if len(item.spots) >= _LEAST_SPOTS]
+    if not usable:
+        raise CalibrationError(
+            f"no slice has {_LEAST_SPOTS} spots or more: two scales and a pose cannot be told from fewer; "
+            "look at the spots with: ctreg segment --overlay DIR"
+        )
+    nominal = _common_nominal(slices, usable)
+    fit: ScaleFit | None = None
+    labelled: list[_Labelled] = []
+    if nominal is not None:
+        labelled, fit = _fit_from(slices, usable, model, nominal, _SLACK_NOMINAL, options)
+    if fit is None:
+        labelled, fit = _search_scales(slices, usable, model, options)
+    if fit is None:
+        raise CalibrationError(
+            f"no scale between {SCALE_RANGE[0]} and {SCALE_RANGE[1]} mm/px explains the spots of {model.name} "
+            "in any slice; check the frame file, and the spots with: ctreg segment --overlay DIR"
+        )
+    return _report(slices, model, nominal, labelled, fit)
+
+
+def _common_nominal(slices: Sequence[SpotSlice], usable: list[int]) -> Scale | None:
+    scales = {(s.s_x, s.s_y) for s in (slices[place].info.scale for place in usable) if s is not None}
+    if len(scales) > 1:
+        raise CalibrationError(
+            f"the slices have {len(scales)} different PixelSpacings; calibrate one reconstruction at a time (--series N)"
+        )
+    return Scale(s_x=scales.copy().pop()[0], s_y=scales.pop()[1]) if scales else None
+
+
+def _fit_from(
+    slices: Sequence[SpotSlice],
+    usable: list[int],
+    model: RodModel,
+    start: Scale,
+    slack: float,
+    options: RegistrationOptions,
+) -> tuple[list[_Labelled], ScaleFit | None]:
+    """Label at a scale, fit, label again at the fitted one, until the labels stay."""
+    scale, labelled, fit = start, list[_Labelled](), None
+    before: object = None
+    for _ in range(_ROUNDS):
+        labelled = [x for x in (_label(slices[p], p, model, scale, slack, options) for p in usable) if x is not None]
+        if not labelled:
+            return [], None
+        fit = fit_scales(slices, labelled, model, scale)
+        if not _believable(fit):
+            return [], None
+        scale = Scale(s_x=float(fit.mm_per_px[0]), s_y=float(fit.mm_per_px[1]))
+        now = [(x.place, x.spot_of_rod.tolist()) for x in labelled]
+        if now == before:
+            break
+        before, slack = now, _SLACK_FITTED
+    return labelled, fit
+
+
+def _believable(fit: ScaleFit) -> bool:
+    low, high = SCALE_RANGE
+    sd = np.sqrt(np.diag(fit.covariance))
+    return bool(
+        np.isfinite(fit.chi2)
+        and fit.degrees_of_freedom > 0
+        and chi2_distribution.sf(fit.chi2, fit.degrees_of_freedom) > BAD_FIT_P**2
+        and (fit.mm_per_px > 0.9 * low).all()
+        and (fit.mm_per_px < 1.1 * high).all()
+        and (sd < 0.2 * fit.mm_per_px).all()
+    )
+
+
+def _label(
+    item: SpotSlice, place: int, model: RodModel, scale: Scale, slack: float, options: RegistrationOptions
+) -> _Labelled | None:
+    """The labels of a slice at a scale known to ``slack``, if they are certain."""
+    registration = _register_loosely(item, model, scale, slack, options)
+    best = registration.best
+    if registration.status != "ok" or best is None or len(best.rod_index) < _LEAST_SPOTS:
+        return None
+    spot_of_rod = np.full(len(model), -1, dtype=np.intp)
+    spot_of_rod[best.rod_index] = best.spot_index
+    return _Labelled(place=place, T=best.T_slice_model, spot_of_rod=spot_of_rod, log_odds=best.log_odds)
+
+
+def _register_loosely(
+    item: SpotSlice, model: RodModel, scale: Scale, slack: float, options: RegistrationOptions
+) -> Registration:
+    """Register with spots as uncertain as a scale error of ``slack`` makes them at the frame's rim."""
+    return register(
+        _loosened(item.spots, model, scale, slack),
+        model,
+        scale=scale,
+        T_patient_slice=item.info.T_patient_slice,
+        thickness_mm=item.info.thickness_mm,
+        shape=item.info.shape,
+        options=options,
+    )
+
+
+def _loosened(spots: Spots, model: RodModel, scale: Scale, slack: float) -> Spots:
+    extra = np.diag((slack * 0.5 * model.size_mm / scale.mm_per_px) ** 2)
+    return Spots(uv_px=spots.uv_px, covariance_px=spots.covariance_px + extra)
+
+
+def fit_scales(
+    slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model: RodModel, start: Scale
+) -> ScaleFit:
+    """Shared scales and one pose a slice, from labelled spots (weighted by their covariances)."""
+    uv = np.stack([slices[x.place].spots.uv_px[x.spot_of_rod] for x in labelled])
+    covariance = np.stack([slices[x.place].spots.covariance_px[x.spot_of_rod] for x in labelled])
+    matched = np.stack([x.spot_of_rod >= 0 for x in labelled])
+    T = np.stack([x.T for x in labelled])
+    return refine_scales(
+        model,
+        T,
+        Observations(uv_px=uv, covariance_px=covariance, matched=matched, mm_per_px=start.mm_per_px),
+    )
+
+
+def _search_scales(
+    slices: Sequence[SpotSlice], usable: list[int], model: RodModel, options: RegistrationOptions
+) -> tuple[list[_Labelled], ScaleFit | None]:
+    """Walk the grid of scales on a few slices; the scale that explains most, confirmed on all slices, wins."""
+    # most spots of the frame and least clutter: near the frame's own number of rods
+    first = sorted(usable, key=lambda p: abs(len(slices[p].spots) - len(model)))[:_FIRST_SLICES]
+    low, high = SCALE_RANGE
+    steps = int(math.ceil(math.log(high / low) / math.log(_GRID_STEP)))
+    grid = np.geomspace(low, high, steps + 1)
+    best: tuple[float, list[_Labelled], ScaleFit] | None = None
+    for aspect in _ASPECTS:
+        starts: list[tuple[float, Scale]] = []
+        for middle in grid:
+            scale = Scale(s_x=float(middle * math.sqrt(aspect)), s_y=float(middle / math.sqrt(aspect)))
+            odds = max(_odds_at(slices[p], model, scale, options) for p in first)
+            if odds > 0.5 * ACCEPT_LOG_ODDS:
+                starts.append((odds, scale))
+        for _, scale in sorted(starts, key=lambda x: -x[0])[:6]:
+            labelled, fit = _fit_from(slices, usable, model, scale, _SLACK_GRID, options)
+            if fit is None:
+                continue
+            worth = sum(x.log_odds for x in labelled)
+            if best is None or worth > best[0] + 1e-6:
+                best = (worth, labelled, fit)
+        if best is not None:
+            break
+    return ([], None) if best is None else best[1:]
+
+
+def _odds_at(item: SpotSlice, model: RodModel, scale: Scale, options: RegistrationOptions) -> float:
+    """ln odds of the best match of one slice at a grid scale."""
+    scene = make_scene(
+        _loosened(item.spots, model, scale, _SLACK_GRID),
+        model,
+        scale,
+        T_patient_slice=item.info.T_patient_slice,
+        thickness_mm=item.info.thickness_mm,
+        shape=item.info.shape,
+        options=options,
+    )
+    matches = search(model, scene, least_matches=_LEAST_SPOTS)
+    if matches is None:
+        return -math.inf
+    return float(doubt(model, scene, matches, least_matches=_LEAST_SPOTS, most=1).log_odds[0])
+
+
+def _report(
+    slices: Sequence[SpotSlice], model: RodModel, nominal: Scale | None, labelled: list[_Labelled], fit: ScaleFit
+) -> CalibrationRun:
+    inflation = 1.0
+    if chi2_distribution.sf(fit.chi2, fit.degrees_of_freedom) < INFLATE_P:
+        inflation = math.sqrt(fit.chi2 / fit.degrees_of_freedom)
+    sd = np.sqrt(np.diag(fit.covariance)) * inflation
+    matched = np.stack([x.spot_of_rod >= 0 for x in labelled])
+    residual = fit.linearisation.residual_px[matched]
+    used = tuple(x.place for x in labelled)
+    left_out = {
+        place: "unreadable" if item.problem else "too_few_spots" if len(item.spots) < _LEAST_SPOTS else "not_certain"
+        for place, item in enumerate(slices)
+        if place not in set(used)
+    }
+    calibration = Calibration(
+        scale=Scale(s_x=float(fit.mm_per_px[0]), s_y=float(fit.mm_per_px[1])),
+        sd_s_x=float(sd[0]),
+        sd_s_y=float(sd[1]),
+        n_slices=len(labelled),
+        n_spots=int(matched.sum()),
+        rms_px=float(np.sqrt((residual**2).mean())),
+        nominal=nominal,
+        model_name=model.name,
+        model_sha256=model.sha256,
+    )
+    return CalibrationRun(
+        calibration=calibration,
+        used=used,
+        T_slice_model=fit.T,
+        covariance=fit.pose_covariance * inflation**2,
+        left_out=left_out,
+        inflation=inflation,
+    )
