@@ -13,7 +13,7 @@ from ctreg_cli.cli.options import ModelName, Quiet
 if TYPE_CHECKING:
     from ctreg_cli.simulation.motion import MotionKind
 
-DEFAULT_FRAMES = 20
+DEFAULT_FRAMES, MAX_FRAMES = 20, 100_000
 CENTRED = "centred"
 #: with fewer spots no pose can be found
 MIN_RODS_FOR_POSE = 3
@@ -42,7 +42,7 @@ def simulate(
     ],
     frames: Annotated[
         int | None,
-        typer.Option(min=1, help="Slices.  [default: 20, or all of a motion file]", show_default=False),
+        typer.Option(min=1, max=MAX_FRAMES, help="Slices.  [default: 20, or all of a motion file]", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed and options give the same bytes.")] = 0,
     motion: Annotated[
@@ -121,10 +121,10 @@ def simulate(
     from ctreg_cli.io.rod_file import load_rod_model
     from ctreg_cli.scale import Scale
     from ctreg_cli.simulation.defaults import suitable_settings
-    from ctreg_cli.simulation.motion import MOTION_KINDS, MotionSettings, advance, displaced, move, slice_times
+    from ctreg_cli.simulation.motion import MOTION_KINDS, MotionSettings, advance, move, slice_times
     from ctreg_cli.simulation.motion_file import read_motion
     from ctreg_cli.simulation.series import simulate_series
-    from ctreg_cli.simulation.start import parse_orientation, start_pose
+    from ctreg_cli.simulation.start import parse_orientation, start_pose, tilted
 
     rod_model = load_rod_model(model)
     chosen: dict[str, Any] = {} if body is Body.auto else {"body": body.value}
@@ -155,8 +155,7 @@ def simulate(
         )
         times_s = slice_times(frames or DEFAULT_FRAMES, interval_s)
         T_start = start_pose(start, rod_model, settings, R_patient_slice, rng)
-        T_start = displaced(T_start, rod_model.centre, np.zeros(3), np.radians(tilt_deg))
-        trajectory = move(T_start, rod_model.centre, times_s, how, rng)
+        trajectory = move(tilted(T_start, rod_model, tilt_deg), rod_model.centre, times_s, how, rng)
     elif start != CENTRED or any(tilt_deg):
         raise InputError("--start and --tilt-deg cannot go with a motion file: its poses are used as they are")
     else:

@@ -17,7 +17,7 @@ from ctreg_cli.simulation.settings import ScannerSettings
 
 #: voxels across a cylinder's diameter, and the least and most voxels along a pixel's side
 VOXELS_PER_DIAMETER = 8
-MIN_VOXELS_PER_PIXEL, MAX_VOXELS_PER_PIXEL = 4, 16
+MIN_VOXELS_PER_PIXEL, MAX_VOXELS_PER_PIXEL = 2, 16
 #: layers of voxels through the slab: at least, at most, and so many while a tilted cylinder slides by its own width
 MIN_LAYERS, MAX_LAYERS, LAYERS_PER_WIDTH = 8, 96, 6
 #: the point-spread function is cut here, in standard deviations
@@ -64,11 +64,13 @@ def cylinder_patch(cylinder: Cylinder, settings: ScannerSettings) -> Patch | Non
         return None
     psf_sd = settings.psf_fwhm_mm / FWHM_PER_SD
     step = settings.scale.mm_per_px
-    reach = radius + PSF_REACH * psf_sd + step
+    blur = PSF_REACH * psf_sd + step
+    reach = radius + blur
     first = np.floor((inside[:, :2].min(axis=0) - reach) / step).astype(int)
     last = np.ceil((inside[:, :2].max(axis=0) + reach) / step).astype(int)
     sides = np.array(settings.shape[::-1])
-    margin = np.ceil(reach / step).astype(int)
+    # what lies further outside the image cannot reach it
+    margin = np.ceil(blur / step).astype(int)
     first, last = np.maximum(first, -margin), np.minimum(last, sides - 1 + margin)
     if (first > sides - 1).any() or (last < 0).any():
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +16,17 @@ NoiseTexture = Literal["fbp", "white"]
 DEFAULT_SCALE = Scale(s_x=0.48828125, s_y=0.48828125)
 #: sides a simulated image may have, px
 MIN_SIDE_PX, MAX_SIDE_PX = 16, 4096
+#: least and greatest value of the numbers in :class:`ScannerSettings`, generous for any scanner
+LIMITS: Mapping[str, tuple[float, float]] = {
+    "thickness_mm": (0.05, 100),
+    "psf_fwhm_mm": (0, 20),
+    "noise_hu": (0, 10_000),
+    "metal_hu": (1, 1_000_000),
+    "rod_diameter_mm": (0.05, 50),
+    "streak_hu": (0, 10_000),
+    "missing_count": (0, 1000),
+    "false_count": (0, 1000),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,10 +67,11 @@ class ScannerSettings:
     false_count: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("thickness_mm", "metal_hu", "rod_diameter_mm"):
-            _check(name, getattr(self, name), above=0.0)
-        for name in ("psf_fwhm_mm", "noise_hu", "streak_hu", "missing_count", "false_count"):
-            _check(name, getattr(self, name), least=0.0)
+        for name, (least, most) in LIMITS.items():
+            value = getattr(self, name)
+            # written so that NaN is refused
+            if not least <= value <= most:
+                raise InputError(f"{name}: {value!r} is not allowed; it must be a number from {least:g} to {most:g}")
         if not all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in self.shape):
             raise InputError(f"shape: {self.shape} (rows, columns) is outside {MIN_SIDE_PX} to {MAX_SIDE_PX} px")
 
@@ -79,9 +91,3 @@ class ScannerSettings:
     def field_of_view_mm(self) -> float:
         """Diameter of the circle inscribed in the image, mm."""
         return min(self.extent_mm)
-
-
-def _check(name: str, value: float, *, above: float = -math.inf, least: float = -math.inf) -> None:
-    if not (math.isfinite(value) and value > above and value >= least):
-        allowed = f"more than {above:g}" if math.isfinite(above) else f"{least:g} or more"
-        raise InputError(f"{name}: {value!r} is not allowed; it must be a number, {allowed}")

@@ -85,6 +85,17 @@ def start_pose(
     return T
 
 
+def tilted(T: FloatArray, model: RodModel, tilt_deg: tuple[float, float, float]) -> FloatArray:
+    """The pose turned about the frame's middle by a rotation vector in slice axes, degrees.
+
+    Raises:
+        InputError: the angles are not finite.
+    """
+    if not all(math.isfinite(angle) for angle in tilt_deg):
+        raise InputError(f"tilt: {tilt_deg} must be three finite angles in degrees")
+    return displaced(T, model.centre, np.zeros(3), np.radians(tilt_deg))
+
+
 def centred_pose(model: RodModel, settings: ScannerSettings, R_patient_slice: FloatArray) -> FloatArray:
     """(4, 4) pose with the frame's middle in the image's middle, turned as its mount says.
 
