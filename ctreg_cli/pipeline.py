@@ -11,18 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.geometry.plucker import skew
-from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
+from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots, measure_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.tracker import Tracked, Tracker
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,6 +129,72 @@ def register_slice(
         options=options,
     )
     return frame_result(index, item, model, registration, method="registered")
+
+
+def track(
+    slices: Iterable[SliceLike],
+    model: RodModel,
+    *,
+    scale: Scale | None = None,
+    options: TrackingOptions | None = None,
+    segmentation: SegmentationOptions | None = None,
+) -> Iterator[FrameResult]:
+    """The slices as one sequence in time: one result for each, in order, as soon as it is there.
+
+    In images only windows about the predicted spots are looked at; the whole slice when that is not enough.
+
+    Args:
+        slices: images, or spots, in the order of time.
+        model: the rods.
+        scale: mm per pixel for all slices; None: each slice's own.
+        options: see :class:`TrackingOptions`.
+        segmentation: see :class:`SegmentationOptions`.
+
+    Raises:
+        MissingScaleError: a slice has no scale and none was given.
+    """
+    segmentation = segmentation or SegmentationOptions()
+    tracker = Tracker(model, options)
+    for place, slice_ in enumerate(slices):
+        yield track_slice(place, slice_, tracker, scale=scale, segmentation=segmentation)
+
+
+def track_slice(
+    place: int, slice_: SliceLike, tracker: Tracker, *, scale: Scale | None, segmentation: SegmentationOptions
+) -> FrameResult:
+    """The next slice of a sequence."""
+    if isinstance(slice_, Slice):
+        override = scale or slice_.info.scale
+        prediction = None if override is None else tracker.predict(slice_.info, override)
+        if override is not None and prediction is not None:
+            where = prediction.visible & _inside(prediction.spots_px, slice_.info.shape)
+            spots = measure_spots(slice_, prediction.spots_px[where], prediction.radius_px[where], segmentation)
+            tracked = tracker.follows(spots, slice_.info, override)
+            if tracked is not None:
+                item = SpotSlice(info=slice_.info, spots=spots)
+                return _tracked_result(place, item, tracker, tracked)
+    item = spots_of(slice_, segmentation)
+    if item.problem:
+        return failure(place if item.index is None else item.index, item, "unreadable")
+    tracked = tracker.step(item.spots, item.info, scale_of(item, scale))
+    return _tracked_result(place, item, tracker, tracked)
+
+
+def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
+    """Which predicted spots lie in the image."""
+    if shape is None:
+        shape = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
+    with np.errstate(invalid="ignore"):
+        low, high = uv_px >= 0, uv_px <= np.array([shape[1] - 1, shape[0] - 1])
+    inside: BoolArray = low[:, 0] & low[:, 1] & high[:, 0] & high[:, 1]
+    return inside
+
+
+def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Tracked) -> FrameResult:
+    index = place if item.index is None else item.index
+    return frame_result(
+        index, item, tracker.model, tracked.registration, method=tracked.method, stability=tracked.stability
+    )
 
 
 def scale_of(item: SpotSlice, override: Scale | None) -> Scale:

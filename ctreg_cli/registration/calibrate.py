@@ -202,9 +202,7 @@ def _loosened(spots: Spots, model: RodModel, scale: Scale, slack: float) -> Spot
     return Spots(uv_px=spots.uv_px, covariance_px=spots.covariance_px + extra)
 
 
-def fit_scales(
-    slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model: RodModel, start: Scale
-) -> ScaleFit:
+def fit_scales(slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model: RodModel, start: Scale) -> ScaleFit:
     """Shared scales and one pose a slice, from labelled spots (weighted by their covariances)."""
     uv = np.stack([slices[x.place].spots.uv_px[x.spot_of_rod] for x in labelled])
     covariance = np.stack([slices[x.place].spots.covariance_px[x.spot_of_rod] for x in labelled])

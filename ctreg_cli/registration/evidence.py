@@ -68,6 +68,8 @@ def log_odds(
     fit: Linearisation,
     matched: BoolArray,
     expected: BoolArray,
+    *,
+    log_prior_density: FloatArray | None = None,
 ) -> FloatArray:
     """ln E (b,) of ``b`` refined hypotheses, in slice millimetres.
 
@@ -79,6 +81,7 @@ def log_odds(
         fit: their linearisation, in millimetres.
         matched: (b, n) rods with a spot.
         expected: (b, n) rods that would have to be seen, matched or not.
+        log_prior_density: (b,) ln π(θ) where a prediction says more than ``prior`` (tracking), per mm³ rad³.
     """
     crossing = fit.predicted_px
     seen = matched | expected
@@ -99,6 +102,8 @@ def log_odds(
     C, _ = covariance_from_information(H, model.size_mm)
     # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not 10⁶
     log_prior = -np.log(field * 2 * model.size_mm * prior.rotation_volume)
+    if log_prior_density is not None:
+        log_prior = log_prior_density
     _, logdet = np.linalg.slogdet(C)
     volume = np.minimum(log_prior + 3 * math.log(2 * math.pi) + 0.5 * logdet, 0.0)
 

@@ -209,7 +209,7 @@ def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[In
         for row, members in enumerate(itertools.combinations(range(n), k)):
             sets[row, list(members)] = True
         holds = sets[:, triples].all(axis=2)  # (sets, triples)
-        open_sets: BoolArray = np.logical_not(holds[:, np.array(chosen, dtype=np.intp)].any(axis=1))
+        open_sets: BoolArray = holds[:, np.array(chosen, dtype=np.intp)].sum(axis=1) == 0
         while open_sets.any():
             gain = holds[open_sets].sum(axis=0) * (1e-3 + strength / strength.max()) * free
             best = int(gain.argmax())
@@ -438,9 +438,22 @@ def observations(scene: Scene, spot_of_rod: IntArray) -> Observations:
 
 
 def assign(model: RodModel, scene: Scene, T: FloatArray, fit: Linearisation) -> IntArray:
-    """Spot of each rod (b, n), one to one: of those within the gate, the assignment that is nearest in all (Hungarian)."""
+    """Spot of each rod (b, n) about refined poses: :func:`nearest_assignment` within their own covariances."""
     H, _ = fit.normal_equations()
     C, _ = covariance_from_information(H + np.diag([1e-6] * 6), model.size_mm)
+    return nearest_assignment(model, scene, T, C)
+
+
+def nearest_assignment(model: RodModel, scene: Scene, T: FloatArray, covariance: FloatArray) -> IntArray:
+    """Spot of each rod (b, n), −1 for none, one to one: of those within the gate the nearest in all (Hungarian).
+
+    Args:
+        model: the rods.
+        scene: the spots.
+        T: (b, 4, 4) poses.
+        covariance: (b, 6, 6) or (6, 6) how well they are known: the gates.
+    """
+    C = np.broadcast_to(covariance, (len(T), 6, 6))
     projection = project(T, model.starts, model.directions)
     may, _ = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     J = np.nan_to_num(motion_field(T, projection))

@@ -139,15 +139,7 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
     if factor > 1:
         best = widened
         warnings.append(("curved_cost", f"the cost is flatter than its curvature says; sd widened {factor:.2f} times"))
-    if best.inflation > 1:
-        warnings.append(
-            ("inflated", f"spots lie farther off than their sd allows; sd widened {best.inflation:.2f} times")
-        )
-    weak = weakness(model, best.covariance)
-    if weak:
-        warnings.append(("weak_geometry", weak))
-    if spots.sd_assumed:
-        warnings.append(("assumed_sd", "the spots came without sd; the covariance rests on an assumed one"))
+    warnings.extend(fit_warnings(model, spots, best))
     if rivals:
         chosen = _distinct_poses([best, *rivals])
         return Registration(
@@ -158,6 +150,21 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
             warnings=tuple(warnings),
         )
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
+
+
+def fit_warnings(model: RodModel, spots: Spots, best: Candidate) -> tuple[tuple[str, str], ...]:
+    """What a user should know of an accepted pose."""
+    warnings: list[tuple[str, str]] = []
+    if best.inflation > 1:
+        warnings.append(
+            ("inflated", f"spots lie farther off than their sd allows; sd widened {best.inflation:.2f} times")
+        )
+    weak = weakness(model, best.covariance)
+    if weak:
+        warnings.append(("weak_geometry", weak))
+    if spots.sd_assumed:
+        warnings.append(("assumed_sd", "the spots came without sd; the covariance rests on an assumed one"))
+    return tuple(warnings)
 
 
 def _distinct_poses(candidates: list[Candidate]) -> list[Candidate]:
