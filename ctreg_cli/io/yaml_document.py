@@ -310,12 +310,14 @@ def _explain(schema: type[BaseModel], details: ErrorDetails) -> Mistake:
         case "too_short" | "too_long":
             wanted = context.get("min_length", context.get("max_length"))
             text = f"needs {wanted} values, has {len(value)}"
+        case "string_too_short":
+            text = "is empty"
         case "greater_than":
-            text = f"{value} is out of range; it must be more than {context['gt']:g}"
+            text = f"{value:g} is out of range; it must be more than {context['gt']:g}"
         case "greater_than_equal":
-            text = f"{value} is out of range; it must not be less than {context['ge']:g}"
+            text = f"{value:g} is out of range; it must not be less than {context['ge']:g}"
         case "less_than_equal":
-            text = f"{value} is out of range; it must not be more than {context['le']:g}"
+            text = f"{value:g} is out of range; it must not be more than {context['le']:g}"
         case "value_error":
             text = str(context["error"])
         case _:
