@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ctreg_cli.cli import options as opt
+from ctreg_cli.cli.console import Talk, counted
 
 if TYPE_CHECKING:
-    from ctreg_cli.registration.calibrate import Calibration
+    from ctreg_cli.registration.calibrate import CalibrationRun
 
 SUFFIXES = (".yaml", ".yml")
 STANDARD_OUTPUT = "-"
@@ -37,8 +39,7 @@ def calibrate(
       ctreg calibrate slices/ -m frame.yaml -o calibration.yaml
       ctreg pose other/ -m frame.yaml -c calibration.yaml
     """
-    from ctreg_cli.cli.console import Talk
-    from ctreg_cli.cli.run import Watched, open_inputs
+    from ctreg_cli.cli.run import open_inputs, warned
     from ctreg_cli.imaging.segmentation import SegmentationOptions
     from ctreg_cli.io.atomic import AtomicFile
     from ctreg_cli.io.calibration_file import calibration_to_yaml
@@ -54,7 +55,7 @@ def calibrate(
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     file = None if output == STANDARD_OUTPUT else AtomicFile(output)
     try:
-        found = segment_slices(Watched(source, talk), SegmentationOptions(polarity=polarity.value))
+        found = segment_slices(warned(source, talk), SegmentationOptions(polarity=polarity.value))
         slices = list(talk.progress(found, total=len(source), what="segment"))
         run = calibrate_slices(slices, rod_model, options=RegistrationOptions(use_mount=use_mount))
         text = calibration_to_yaml(run.calibration)
@@ -66,13 +67,18 @@ def calibrate(
     finally:
         if file:
             file.abandon()
-    talk.table(_rows(run.calibration, len(source)))
+    talk.table(_rows(run, len(source)))
+    for place, reason in run.left_out.items():
+        talk.explain(f"slice {place} ({slices[place].info.source}): left out, {reason}")
 
 
-def _rows(calibration: Calibration, n_slices: int) -> list[tuple[str, str]]:
+def _rows(run: CalibrationRun, n_slices: int) -> list[tuple[str, str]]:
     """What was found, and how it compares with DICOM's PixelSpacing."""
+    calibration = run.calibration
     nominal, scale = calibration.nominal, calibration.scale
     rows = [("slices", f"{calibration.n_slices} of {n_slices} used, {calibration.n_spots} spots")]
+    if run.left_out:
+        rows.append(("left out", counted(Counter(run.left_out.values()))))
     for name, value, sd, stated in (
         ("s_x", scale.s_x, calibration.sd_s_x, nominal and nominal.s_x),
         ("s_y", scale.s_y, calibration.sd_s_y, nominal and nominal.s_y),

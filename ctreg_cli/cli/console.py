@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import typer
@@ -16,6 +16,12 @@ Item = TypeVar("Item")
 def error(text: str) -> None:
     """The one way an error is shown."""
     typer.echo(f"ctreg: error: {text}", err=True)
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """``3 too_few_spots, 1 unreadable``: the most frequent first."""
+    ranked = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+    return ", ".join(f"{count} {word}" for word, count in ranked)
 
 
 class Talk:

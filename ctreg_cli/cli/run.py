@@ -9,8 +9,7 @@ from typing import TypeVar
 
 import typer
 
-from ctreg_cli.cli.console import Talk
-from ctreg_cli.cli.summary import counted
+from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.sinks import Sinks
@@ -72,26 +71,31 @@ def choose_scale(
     return ScaleChoice(scale=None, origin="dicom" if source.kind == "images" else "spots")
 
 
+def warned(source: Source, talk: Talk) -> Iterator[SliceLike]:
+    """The slices, with broken ones named as they pass."""
+    n_broken = 0
+    for item in source:
+        if not isinstance(item, Slice) and item.problem:
+            n_broken += 1
+            if n_broken <= MAX_NAMED:
+                talk.warn(f"{item.info.source}: {item.problem}")
+        yield item
+    if n_broken > MAX_NAMED:
+        talk.warn(f"... and {n_broken - MAX_NAMED} more slices that could not be read")
+
+
 @dataclass(slots=True)
 class Watched:
-    """Slices on their way into the pipeline: broken ones are named, and those not yet answered can be looked at."""
+    """Slices on their way into the pipeline, of which those not yet answered can still be looked at."""
 
     source: Source
     talk: Talk
     waiting: deque[SliceLike] = field(default_factory=deque)
-    n_broken: int = 0
 
     def __iter__(self) -> Iterator[SliceLike]:
-        for item in self.source:
-            problem = getattr(item, "problem", "")
-            if problem:
-                self.n_broken += 1
-                if self.n_broken <= MAX_NAMED:
-                    self.talk.warn(f"{item.info.source}: {problem}")
+        for item in warned(self.source, self.talk):
             self.waiting.append(item)
             yield item
-        if self.n_broken > MAX_NAMED:
-            self.talk.warn(f"... and {self.n_broken - MAX_NAMED} more slices that could not be read")
 
     def answered(self) -> Slice | None:
         """The slice whose result has just come, if it has pixels."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ctreg_cli.cli.console import counted
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.io.results import accepted
 from ctreg_cli.pipeline import FrameResult
@@ -20,12 +20,6 @@ SCALE_SOURCES = {
     "calibration": "the calibration file",
     "option": "--scale",
 }
-
-
-def counted(counts: Mapping[str, int]) -> str:
-    """``3 too_few_spots, 1 unreadable``: the most frequent first."""
-    ranked = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
-    return ", ".join(f"{count} {word}" for word, count in ranked)
 
 
 @dataclass(slots=True)
