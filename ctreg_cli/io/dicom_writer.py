@@ -21,8 +21,8 @@ from ctreg_cli.imaging.slice import Slice
 
 #: the only name and id ever written
 PATIENT = "SIMULATED"
-#: time 0 of every series
-EPOCH = datetime(2000, 1, 1, 12)
+#: time 0 of every series; midnight, so that the time of day is the time of the truth
+EPOCH = datetime(2000, 1, 1)
 #: display window for metal in tissue, HU
 WINDOW_CENTRE_HU, WINDOW_WIDTH_HU = 650, 1700
 TUBE_KV = 120

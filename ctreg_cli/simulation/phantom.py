@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,40 +74,29 @@ def simulate_slice(
     crossings = rod_crossings(model, T_slice_model, settings)
     absent = _absent_rods(model, crossings.visible, settings, rng)
     seen = np.flatnonzero(crossings.visible & ~absent)
-    clutter = _false_objects(crossings.uv_px[crossings.visible] * settings.scale.mm_per_px, settings, rng)
-    starts, ends = rod_ends(model, T_slice_model)
-    diameters = rod_diameters(model, settings)
-    rods = [
-        Cylinder(start=starts[i], end=ends[i], diameter_mm=float(diameters[i]), hu=settings.metal_hu)
-        for i in np.flatnonzero(~absent)
-    ]
+    mm_per_px = settings.scale.mm_per_px
+    clutter = _false_objects(crossings.uv_px[crossings.visible] * mm_per_px, settings, rng)
 
     image = body_hu(settings, room_mm(model, settings)).copy()
     if settings.block and (block := block_patch(model, T_slice_model, settings)) is not None:
         blend(image, block, ACRYLIC_HU)
-    for cylinder in (*rods, *clutter):
+    for cylinder in (*_rods(model, T_slice_model, np.flatnonzero(~absent), settings), *clutter):
         if (patch := cylinder_patch(cylinder, settings)) is not None:
             blend(image, patch, cylinder.hu)
-    add_streaks(image, crossings.uv_px[seen] * settings.scale.mm_per_px, settings, rng)
+    add_streaks(image, crossings.uv_px[seen] * mm_per_px, settings, rng)
     add_noise(image, settings, rng)
 
-    given = info or SliceInfo(source="simulated")
-    padding = (float(PADDING_STORED), float(PADDING_STORED)) if settings.padding else None
     return SimulatedSlice(
         slice=Slice(
-            info=SliceInfo(
-                source=given.source,
-                time_s=given.time_s,
+            info=replace(
+                info or SliceInfo(source="simulated"),
                 scale=settings.scale,
-                T_patient_slice=given.T_patient_slice,
                 thickness_mm=settings.thickness_mm,
                 shape=settings.shape,
-                series=given.series,
-                uids=given.uids,
             ),
             stored=digitise(image, settings),
             intercept=INTERCEPT_HU,
-            padding=padding,
+            padding=(PADDING_STORED, PADDING_STORED) if settings.padding else None,
         ),
         T_slice_model=T_slice_model,
         rod_index=frozen_index(seen),
@@ -115,10 +104,8 @@ def simulate_slice(
         lambda_mm=frozen(crossings.lambda_mm[seen], (None,)),
         through=crossings.through[seen],
         missing_rods=frozen_index(np.flatnonzero(crossings.visible & absent)),
-        false_px=frozen(
-            [(c.start + c.end)[:2] / 2 / settings.scale.mm_per_px for c in clutter], (None, 2)
-        ),
-    )  # fmt: skip
+        false_px=frozen([(false.start + false.end)[:2] / 2 / mm_per_px for false in clutter], (None, 2)),
+    )
 
 
 def render_slice(
@@ -135,6 +122,14 @@ def digitise(image_hu: FloatArray, settings: ScannerSettings) -> NDArray[np.int1
     if settings.padding:
         stored[outside_view(settings)] = PADDING_STORED
     return stored
+
+
+def _rods(model: RodModel, T_slice_model: FloatArray, indices: IntArray, settings: ScannerSettings) -> list[Cylinder]:
+    starts, ends = rod_ends(model, T_slice_model)
+    diameters = rod_diameters(model, settings)
+    return [
+        Cylinder(start=starts[i], end=ends[i], diameter_mm=float(diameters[i]), hu=settings.metal_hu) for i in indices
+    ]
 
 
 def _absent_rods(model: RodModel, visible: BoolArray, settings: ScannerSettings, rng: np.random.Generator) -> BoolArray:

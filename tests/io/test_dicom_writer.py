@@ -96,7 +96,7 @@ def test_a_time_past_midnight_goes_on_in_the_next_day() -> None:
     simulated = series("axial", n=1)[0]
     info = SliceInfo(
         source="late.dcm",
-        time_s=12 * 3600 + 1.25,
+        time_s=24 * 3600 + 1.25,
         scale=simulated.slice.info.scale,
         T_patient_slice=simulated.slice.info.T_patient_slice,
     )

@@ -14,7 +14,10 @@ from typer.testing import CliRunner, Result
 
 from ctreg_cli.cli.simulate import simulate
 from ctreg_cli.errors import InputError
+from ctreg_cli.imaging.slice import Slice
+from ctreg_cli.io.images import open_images
 from ctreg_cli.io.results import read_results
+from ctreg_cli.io.spots_file import read_spots
 
 FRAME = "rod-cube-30x30x40"
 #: a small image, so that a run takes a moment
@@ -106,3 +109,21 @@ def test_a_bad_option_is_one_sentence_and_leaves_nothing(options: tuple[str, ...
     assert what in str(result.exception)
     assert "\n" not in str(result.exception)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctregs_own_readers_find_the_truth_again(tmp_path: Path) -> None:
+    folder = tmp_path / "series"
+    options = ("--frames", 3, "--orientation", "14,-6,30", "--step-mm", 1.5, "--false", 1)
+    assert run("-o", folder, *options, *SMALL).exit_code == 0
+    document = json.loads((folder / "truth.json").read_text())["results"]
+    images, spots = open_images([folder]), read_spots(folder / "truth_spots.csv")
+    for image, spot_slice, true in zip(images, spots, document, strict=True):
+        assert isinstance(image, Slice)
+        assert image.info.source == spot_slice.info.source == true["source"]
+        assert image.info.time_s == spot_slice.info.time_s == true["time_s"]
+        assert image.info.scale == spot_slice.info.scale
+        assert image.info.T_patient_slice is not None
+        in_patient = image.info.T_patient_slice @ np.array(true["T_slice_model"])
+        assert np.allclose(in_patient, true["T_patient_model"], atol=1e-9)
+        places = [(match["u_px"], match["v_px"]) for match in true["matches"]]
+        assert np.allclose(spot_slice.spots.uv_px[:-1], places, atol=1e-9)
