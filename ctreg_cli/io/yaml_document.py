@@ -27,6 +27,8 @@ from ctreg_cli.errors import InputError
 MAX_BYTES = 256 * 1024
 MAX_DEPTH = 16
 MAX_MISTAKES_SHOWN = 50
+#: how the ``schema`` of every file of ours begins: ctreg/<kind>/<version>
+FAMILY = "ctreg/"
 
 KeyPath = tuple[str | int, ...]
 Place = tuple[int, int]
@@ -133,6 +135,7 @@ class Document:
         Raises:
             InputError: (of the kind given on reading) one line a mistake, ``file:line:col: key: what is wrong``.
         """
+        self._refuse_another_kind(schema)
         mistakes = [*self.mistakes, *((self._place(path), path, text) for path, text in checks(self.data))]
         try:
             result = schema.model_validate(self.data)
@@ -141,13 +144,24 @@ class Document:
         else:
             if not mistakes:
                 return result
+        raise self._refusal(mistakes)
+
+    def _refuse_another_kind(self, schema: type[BaseModel]) -> None:
+        """A calibration given as a frame is one mistake, not one for every key."""
+        (expected,) = get_args(schema.model_fields["schema_"].annotation)
+        written = self.data.get("schema")
+        if isinstance(written, str) and written.startswith(FAMILY) and _kind(written) != _kind(expected):
+            what = f"this is a {_kind(written)} file, but a {_kind(expected)} file ('{expected}') is needed here"
+            raise self._refusal([(self._place(("schema",)), ("schema",), what)])
+
+    def _refusal(self, mistakes: Iterable[_Located]) -> InputError:
         lines = [
             f"{self.path}:{line}:{column}: {_dotted(path)}: {text}"
             for (line, column), path, text in sorted(mistakes, key=_order)
         ]
         if len(lines) > MAX_MISTAKES_SHOWN:
             lines[MAX_MISTAKES_SHOWN:] = [f"{self.path}: ... and {len(lines) - MAX_MISTAKES_SHOWN} more mistakes"]
-        raise self.error("\n".join(lines))
+        return self.error("\n".join(lines))
 
     def _locate(self, schema: type[BaseModel], details: ErrorDetails) -> _Located:
         path, text = _explain(schema, details)
@@ -158,6 +172,10 @@ class Document:
         while path not in self.places:
             path = path[:-1]  # a missing key: the group it is missing from
         return self.places[path]
+
+
+def _kind(schema: str) -> str:
+    return schema.removeprefix(FAMILY).split("/")[0]
 
 
 def _dotted(path: KeyPath) -> str:
