@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
@@ -35,6 +36,8 @@ BAD_FIT_P = 1e-4
 INFLATE_P = 1e-2
 #: beyond this condition number (rotation in frame sizes) the weak direction is named in a warning
 WEAK_CONDITION = 60.0
+#: probability of a false match beyond which it is mentioned
+_WORTH_SAYING = 1e-3
 #: matches below which nothing can be checked: three spots always fit
 LEAST_MATCHES = 4
 
@@ -125,11 +128,9 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
         return refused("no_consistent_match")
     if chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P:
         return refused("bad_fit")
-    rivals = [
-        c
-        for c in candidates[1:]
-        if c.log_odds > best.log_odds - math.log(RIVAL_ODDS) and pose_distance_sd(best, c) > RIVAL_SD
-    ]
+    near = [c for c in candidates[1:] if c.log_odds > best.log_odds - math.log(RIVAL_ODDS)]
+    rivals = [c for c in near if pose_distance_sd(best, c) > RIVAL_SD and _apart(best, c)]
+    doubts = [c for c in near if not _apart(best, c)]
     warnings: list[tuple[str, str]] = []
     widened, factor = widen_where_curved(model, scene, matches, best)
     if widened is None:
@@ -139,6 +140,11 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
     if factor > 1:
         best = widened
         warnings.append(("curved_cost", f"the cost is flatter than its curvature says; sd widened {factor:.2f} times"))
+    best, share = averaged(best, doubts)
+    if share > _WORTH_SAYING:
+        warnings.append(
+            ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
+        )
     warnings.extend(fit_warnings(model, spots, best))
     if rivals:
         chosen = _distinct_poses([best, *rivals])
@@ -224,6 +230,39 @@ def assemble_candidate(
     )
 
 
+def _apart(a: Candidate, b: Candidate) -> bool:
+    """Whether two poses contradict each other, and not one of them merely knows less (a match fewer) than the other."""
+    twist = poses.difference(b.T_slice_model, a.T_slice_model)
+    return float(twist @ np.linalg.pinv(a.covariance + b.covariance, hermitian=True) @ twist) > RIVAL_SD**2
+
+
+def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
+    """``best`` with a covariance that covers the variants of its own match: Bayesian model averaging about its pose.
+
+    A variant without the one spot that fixes a direction (``doubts``) contradicts nothing, but if it is the truth, the error
+    is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``, the weights w from the odds.
+
+    Returns the candidate and the weight of all variants together.
+    """
+    if not doubts:
+        return best, 0.0
+    weights = np.exp([c.log_odds - best.log_odds for c in doubts])
+    total = 1 + float(weights.sum())
+    covariance = np.array(best.covariance)
+    for weight, c in zip(weights, doubts, strict=True):
+        delta = poses.difference(c.T_slice_model, best.T_slice_model)
+        covariance += weight * (c.covariance + np.outer(delta, delta))
+    # never narrower than the match itself says
+    widened = best.covariance + _positive_part(covariance / total - best.covariance)
+    return replace(best, covariance=frozen(widened, (6, 6))), float(weights.sum()) / total
+
+
+def _positive_part(M: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(M)
+    result: FloatArray = (vectors * np.maximum(values, 0)) @ vectors.T
+    return result
+
+
 def pose_distance_sd(a: Candidate, b: Candidate) -> float:
     """How many standard deviations of ``a`` the pose of ``b`` lies away."""
     twist = poses.difference(b.T_slice_model, a.T_slice_model)
@@ -286,5 +325,4 @@ def widen_where_curved(
     widened = (
         best.covariance + (factor**2 - 1) * np.outer(direction / unit, direction / unit) * sd**2 * best.inflation**2
     )
-    fields = {name: getattr(best, name) for name in Candidate.__dataclass_fields__}
-    return Candidate(**{**fields, "covariance": frozen(widened, (6, 6))}), factor
+    return replace(best, covariance=frozen(widened, (6, 6))), factor
