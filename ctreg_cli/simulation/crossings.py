@@ -67,7 +67,8 @@ def rod_diameters(model: RodModel, settings: ScannerSettings) -> FloatArray:
 def in_view(uv_px: FloatArray, settings: ScannerSettings) -> BoolArray:
     """(n,) whether places (n, 2) lie in the image, and not in its padding."""
     rows, columns = settings.shape
-    inside: BoolArray = np.logical_and(uv_px >= -0.5, uv_px <= [columns - 0.5, rows - 0.5]).all(axis=1)
+    u, v = uv_px.T
+    inside: BoolArray = (u >= -0.5) & (u <= columns - 0.5) & (v >= -0.5) & (v <= rows - 0.5)
     if not settings.padding:
         return inside
     radii = np.linalg.norm(uv_px * settings.scale.mm_per_px - settings.centre_mm, axis=1)
