@@ -24,6 +24,8 @@ TWIN_SD = 3.0
 MIN_TWIN_MM = 0.3
 #: a frame that does worse than this where most rods are seen deserves a remark
 WEAK_ROTATION_DEG = 2.0
+#: triples of rods grow with the cube of their number: no listing of sets and symmetries beyond this
+MAX_RODS_LISTED = 100
 #: from this number of rods on, a slice has redundancy to speak of (method §7)
 REDUNDANT_RODS = 5
 
@@ -67,8 +69,10 @@ def check_design(model: RodModel, options: DesignOptions | None = None) -> Desig
     seeded slices, so that the answer is the same every time.
     """
     options = options or DesignOptions()
-    parallel, coplanar = parallel_triples(model), coplanar_triples(model)
-    twins = symmetries(model, within_mm=max(MIN_TWIN_MM, TWIN_SD * float(model.tolerances.max())))
+    listed = model if len(model) <= MAX_RODS_LISTED else model.subset(range(MAX_RODS_LISTED))
+    parallel, coplanar = parallel_triples(listed), coplanar_triples(listed)
+    whole = listed is model
+    twins = symmetries(model, within_mm=max(MIN_TWIN_MM, TWIN_SD * float(model.tolerances.max()))) if whole else ()
     slices = sample_slices(model, options)
     enough = slices.seen.sum(axis=1) >= MIN_RODS_SEEN
     pose_rank = int(slices.pose_rank[enough].max(initial=0))
@@ -116,6 +120,8 @@ def _problems(
 def _remarks(
     model: RodModel, twins: Iterable[Symmetry], linear_rank: int, quality: tuple[SliceQuality, ...]
 ) -> Iterator[str]:
+    if len(model) > MAX_RODS_LISTED:
+        yield f"more than {MAX_RODS_LISTED} rods: sets are listed among the first {MAX_RODS_LISTED}, symmetries not at all"
     for i, j in coincident_pairs(model):
         yield f"rods {model.ids[i]} and {model.ids[j]} lie on one line, one over the other: written twice?"
     for twin in twins:
