@@ -1,4 +1,4 @@
-"""The bright blob in the middle of a window: background, height, half-height region. The crude measure before the fit."""
+"""The bright blob in the middle of a window: its background, height and half-height region, measured before any fit."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
+#: a window is moved to its blob's centre at most so often; once is nearly always enough
+RECENTRINGS = 3
 #: a pixel is 1/12 px² wide in second moments
 _PIXEL_VARIANCE = 1.0 / 12.0
+
+_ARRAYS = ("middles", "values", "background", "height", "own", "foreign", "centre", "moments")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,19 +38,33 @@ class Blobs:
     centre: FloatArray
     moments: FloatArray
 
+    def __len__(self) -> int:
+        return len(self.middles)
+
+    @property
+    def uv_px(self) -> FloatArray:
+        """(k, 2) centres of gravity in the image, px."""
+        uv: FloatArray = self.middles + self.centre
+        return uv
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Full length (k,) of the long and the short axis of the uniform ellipse with these moments, px; angle, rad."""
+        half_trace = 0.5 * (self.moments[:, 0, 0] + self.moments[:, 1, 1])
+        half_difference = 0.5 * (self.moments[:, 0, 0] - self.moments[:, 1, 1])
+        root = np.hypot(half_difference, self.moments[:, 0, 1])
+        major, minor = 4.0 * np.sqrt(half_trace + root), 4.0 * np.sqrt(np.maximum(half_trace - root, 0.0))
+        return major, minor, 0.5 * np.arctan2(self.moments[:, 0, 1], half_difference)
+
     @property
     def area(self) -> FloatArray:
         """(k,) pixels above half height."""
-        area: FloatArray = self.own.sum(axis=(1, 2)).astype(np.float64)
-        return area
+        return np.asarray(self.own.sum(axis=(1, 2), dtype=np.float64))
 
     @property
     def cut_off(self) -> BoolArray:
         """(k,) whether the blob reaches the ring that should show its background: the window is too small."""
-        u, v = grid(self.radius)
-        edge = np.hypot(u, v) > self.radius - 2
-        reached: BoolArray = (self.own & edge).any(axis=(1, 2))
-        return reached
+        return np.asarray(self.own.reshape(len(self), -1)[:, ring(self.radius)].any(axis=1))
 
     @property
     def at_border(self) -> BoolArray:
@@ -54,31 +72,40 @@ class Blobs:
         nothing = np.isnan(self.values)
         if not nothing.any():
             return np.zeros(len(self.values), dtype=bool)
-        touching: BoolArray = (dilated(nothing) & self.own).any(axis=(1, 2))
-        return touching
+        return np.asarray((dilated(nothing) & self.own).any(axis=(1, 2)))
 
     def take(self, which: BoolArray | IntArray) -> Blobs:
         """Some of the blobs."""
-        arrays = ("middles", "values", "background", "height", "own", "foreign", "centre", "moments")
-        return Blobs(radius=self.radius, **{name: getattr(self, name)[which] for name in arrays})
+        return Blobs(radius=self.radius, **{name: getattr(self, name)[which] for name in _ARRAYS})
+
+    def replaced(self, at: IntArray, by: Blobs) -> Blobs:
+        """The same blobs but for those at the indices ``at``."""
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
+        for name, values in arrays.items():
+            values[at] = getattr(by, name)
+        return Blobs(radius=self.radius, **arrays)
 
 
 def measure_blobs(image: UprightImage, peaks: IntArray, radius: int) -> Blobs:
-    """Measure the blobs at ``peaks`` (k, 2), twice: the second time in windows centred on the blobs themselves.
+    """Measure the blobs at ``peaks`` (k, 2) in windows centred on the blobs themselves.
 
-    So whoever comes with a slightly other peak of the same blob gets the same windows, and the same centre from them.
+    So whoever comes with another peak of the same blob gets the same window, and the same centre from it.
     """
-    first = _measure(image, peaks, radius)
-    middles = first.middles + np.rint(first.centre).astype(np.intp)
-    moved = (middles != first.middles).any(axis=1)
-    return _measure(image, middles, radius) if moved.any() else first
+    blobs = _measure(image, peaks, radius)
+    for _ in range(RECENTRINGS):
+        middles = np.rint(blobs.uv_px).astype(np.intp)
+        moved = np.flatnonzero((middles != blobs.middles).any(axis=1) & ~blobs.cut_off)
+        if not len(moved):
+            break
+        blobs = blobs.replaced(moved, _measure(image, middles[moved], radius))
+    return blobs
 
 
 def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
     values = image.windows(middles, radius)
     k = len(values)
     u, v = grid(radius)
-    background = np.nan_to_num(nan_quantile(values[:, ring(radius)], BACKGROUND_QUANTILE))
+    background = np.nan_to_num(nan_quantile(values.reshape(k, -1)[:, ring(radius)], BACKGROUND_QUANTILE))
     above = np.where(np.isnan(values), -np.inf, values - background[:, None, None])
     core = np.hypot(u, v) < 2.0
     peak = np.where(core, above, -np.inf).reshape(k, -1).argmax(axis=1)

@@ -1,32 +1,37 @@
 """Centres of spots at the statistical bound, with covariances that own up to streaks.
 
 The profile of :mod:`ctreg_cli.imaging.profile` is fitted to all windows at once by Levenberg–Marquardt. Pixels are
-weighted by what can be wrong with them: noise everywhere, and structure of the background (streaks, plate edges) growing
-with the distance from the blob. The covariance has the same two parts: the noise seen through the estimator, and the
-structure *left over* around the blob seen through it as a correlated field. Both are measured in the window.
+weighted by what can be wrong with them: noise everywhere, and structure of the background (streaks, plate edges) that
+grows with the distance from the blob. The covariance has the same two parts: the noise seen through the estimator, and
+the structure *left over* around the blob seen through it as a correlated field. Both are measured in the window.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 from ctreg_cli.imaging.blob import Blobs
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, evaluate
-from ctreg_cli.imaging.window import dilated, grid, nan_quantile, ring
+from ctreg_cli.imaging.window import dilated, disc, grid, nan_quantile, ring
 
-#: steps of the fit; the centre settles in four (later ones move it by less than a tenth of its sd)
-ITERATIONS = 6
+#: steps of the fit: later ones move a centre by less than a tenth of its sd
+ITERATIONS = 5
 #: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
 STRUCTURE_WEIGHT = 3.0
 #: correlation length of background structure, px: the width of streaks, which the same blur has made as the spots
 STRUCTURE_LENGTH_PX = 2.0
-#: how far beyond the blob's edge the structure that disturbs it is looked at, px
-STRUCTURE_REACH_PX = (1.0, 4.0)
+#: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
+NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
 #: this many pixels at the image's ceiling inside one blob mean that it was cut off there
 MIN_CLIPPED_PX = 3
+#: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
+MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
+#: sd of a normal distribution over its median absolute deviation
+MAD_TO_SD = 1.4826
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
 #: start and width (sd) of ln β: between a Gaussian and a flat top; and the sd of the logarithms of height and size
@@ -57,26 +62,30 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
         blobs: windows of one radius.
         ceiling: value at which the image is cut off; pixels of that value are taken as "at least so bright".
     """
-    k = len(blobs.middles)
-    u, v = (axis.ravel() for axis in grid(blobs.radius))
-    values = blobs.values.reshape(k, -1)
+    k = len(blobs)
+    at = disc(blobs.radius)
+    u, v = (axis.ravel()[at] for axis in grid(blobs.radius))
+    values = blobs.values.reshape(k, -1)[:, at]
     missing = np.isnan(values)
     values = np.where(missing, blobs.background[:, None], values)
     clipped = values >= ceiling
-    clipped &= ((clipped & blobs.own.reshape(k, -1)).sum(axis=1) >= MIN_CLIPPED_PX)[:, None]
+    own = blobs.own.reshape(k, -1)[:, at]
+    clipped &= ((clipped & own).sum(axis=1) >= MIN_CLIPPED_PX)[:, None]
     distance = _distance_beyond_edge(blobs, u, v)
-    usable = ~missing & ~dilated(blobs.foreign).reshape(k, -1)
-    noise = _pixel_noise(blobs, distance, usable)
+    usable = ~missing & ~dilated(blobs.foreign).reshape(k, -1)[:, at]
+    noise = _pixel_noise(blobs, usable & (distance > NOISE_BEYOND_PX))
     structure = _background_structure(blobs, noise)
     reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
     spread = STRUCTURE_WEIGHT * structure[:, None] * distance / reach[:, None]
     weights = usable / (noise[:, None] ** 2 + spread**2)
 
-    start = _start(blobs, clipped)
+    start = _start(blobs, (clipped & own).sum(axis=1))
     parameters, residuals, jacobian, normal = _levenberg_marquardt(start, u, v, values, clipped, weights)
 
     influence = np.linalg.inv(normal)[:, CENTRE] @ (jacobian * weights[:, None])  # (k, 2, p): d centre / d pixel
-    covariance = _seen_noise(influence, noise) + _seen_structure(influence, residuals, distance, usable, noise)
+    covariance = _seen_noise(influence, noise) + _seen_structure(
+        influence, residuals, blobs.radius, usable & (distance > NEAR_PX[0]) & (distance < NEAR_PX[1]), noise
+    )
     centre = parameters[:, CENTRE]
     away = ((centre - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
@@ -91,48 +100,54 @@ def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatAr
     x, y = u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None]
     metric = np.linalg.inv(4.0 * blobs.moments)  # a uniform ellipse has moments of a quarter of its semi-axes squared
     radius = np.sqrt(metric[:, 0, 0, None] * x * x + 2 * metric[:, 0, 1, None] * x * y + metric[:, 1, 1, None] * y * y)
-    distance: FloatArray = np.hypot(x, y) * np.maximum(0.0, 1.0 - 1.0 / np.maximum(radius, 1e-9))
-    return distance
+    return np.asarray(np.hypot(x, y) * np.maximum(0.0, 1.0 - 1.0 / np.maximum(radius, 1e-9)))
 
 
-def _pixel_noise(blobs: Blobs, distance: FloatArray, usable: BoolArray) -> FloatArray:
-    """Sd (k,) of the noise that differs from pixel to pixel, by the Laplacian, which no gradient or wide streak moves."""
+def _pixel_noise(blobs: Blobs, quiet: BoolArray) -> FloatArray:
+    """Sd (k,) of the noise that differs from pixel to pixel: by the Laplacian, which no gradient or wide streak moves.
+
+    ``quiet`` (k, p) says which pixels of the disc lie apart from any blob.
+    """
     w = blobs.values
-    laplacian = 4 * w[:, 1:-1, 1:-1] - w[:, :-2, 1:-1] - w[:, 2:, 1:-1] - w[:, 1:-1, :-2] - w[:, 1:-1, 2:]
-    n = 2 * blobs.radius + 1
-    quiet = (usable & (distance > 2.0)).reshape(-1, n, n)[:, 1:-1, 1:-1]
-    sample = np.where(quiet, np.abs(laplacian), np.nan).reshape(len(w), -1)
-    sd = 1.4826 * nan_quantile(sample, 0.5) / np.sqrt(20.0)  # 4² + 4 · 1² = 20
-    return np.maximum(np.nan_to_num(sd), ROUNDING_SD)
+    laplacian = np.full(w.shape, np.nan)
+    laplacian[:, 1:-1, 1:-1] = (
+        4 * w[:, 1:-1, 1:-1] - w[:, :-2, 1:-1] - w[:, 2:, 1:-1] - w[:, 1:-1, :-2] - w[:, 1:-1, 2:]
+    )
+    sample = np.where(quiet, np.abs(laplacian.reshape(len(w), -1)[:, disc(blobs.radius)]), np.nan)
+    sd = MAD_TO_SD * nan_quantile(sample, 0.5) / np.sqrt(20.0)  # 4² + 4 · 1² = 20
+    return np.asarray(np.maximum(np.nan_to_num(sd), ROUNDING_SD))
 
 
 def _background_structure(blobs: Blobs, noise: FloatArray) -> FloatArray:
     """Sd (k,) of what the ring about the blob holds beyond noise, after its best plane is taken off."""
-    u, v = grid(blobs.radius)
-    at = ring(blobs.radius)
-    values = blobs.values[:, at]
+    values = blobs.values.reshape(len(blobs), -1)[:, ring(blobs.radius)]
     values = np.where(np.isnan(values), blobs.background[:, None], values)
-    plane = np.stack([np.ones(at.sum()), u[at], v[at]], axis=1)
-    left = values - (values @ np.linalg.pinv(plane).T) @ plane.T
-    spread = 1.4826 * np.median(np.abs(left), axis=1)
+    left = values - values @ _plane_projector(blobs.radius)
+    spread = MAD_TO_SD * nan_quantile(np.abs(left), 0.5)
     return np.sqrt(np.maximum(spread**2 - noise**2, 0.0))
 
 
-def _start(blobs: Blobs, clipped: BoolArray) -> FloatArray:
-    """First parameters (k, 10) from the blob's moments.
+@cache
+def _plane_projector(radius: int) -> FloatArray:
+    """(p, p): values on the ring → the best plane through them, there."""
+    u, v = (axis.ravel()[ring(radius)] for axis in grid(radius))
+    plane = np.stack([np.ones(len(u)), u, v], axis=1)
+    return frozen(plane @ np.linalg.pinv(plane), (len(u), len(u)))
 
-    Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the flat
-    part covers ``log2 a / (1 + log2 a)`` of what lies above h/2.
+
+def _start(blobs: Blobs, n_clipped: IntArray) -> FloatArray:
+    """First parameters (k, 10) from the blob's moments and the number (k,) of its pixels that are cut off.
+
+    Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the
+    flat part covers ``log2 a / (1 + log2 a)`` of what lies above h/2.
     """
-    k = len(blobs.middles)
-    flat = np.where(blobs.own.reshape(k, -1), clipped, False).sum(axis=1) / np.maximum(blobs.area, 1.0)
-    flat = np.minimum(flat, 0.75)
-    log2_over = np.clip(flat / (1.0 - flat), 0.1, 2.5)
+    flat = np.minimum(n_clipped / blobs.area, MAX_FLAT_SHARE)
+    log2_over = np.maximum(flat / (1.0 - flat), MIN_LOG2_OVER)
     metric = np.linalg.inv(4.0 * blobs.moments) * ((1.0 + log2_over) ** np.exp(-START_LOG_BETA))[:, None, None]
     l_vv = np.sqrt(metric[:, 1, 1])
     l_uv = metric[:, 0, 1] / l_vv
-    l_uu = np.sqrt(np.maximum(metric[:, 0, 0] - l_uv**2, 1e-6))
-    start = np.zeros((k, N_PARAMETERS))
+    l_uu = np.sqrt(np.linalg.det(metric)) / l_vv
+    start = np.zeros((len(blobs), N_PARAMETERS))
     start[:, CENTRE] = blobs.centre
     start[:, LOG_HEIGHT] = log2_over * np.log(2.0) + np.log(blobs.height)
     start[:, BACKGROUND] = blobs.background
@@ -171,11 +186,14 @@ def _levenberg_marquardt(
         trial_residuals, trial_jacobian = evaluate(trial, u, v, values, clipped)
         trial_cost = cost_of(trial_residuals, trial)
         better = trial_cost <= cost
+        damping *= np.where(better, 0.1, 10.0)
+        if better.all():
+            parameters, residuals, jacobian, cost = trial, trial_residuals, trial_jacobian, trial_cost
+            continue
         parameters = np.where(better[:, None], trial, parameters)
         residuals = np.where(better[:, None], trial_residuals, residuals)
         jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
         cost = np.where(better, trial_cost, cost)
-        damping *= np.where(better, 0.1, 10.0)
     normal, _ = _normal_equations(jacobian, weights, residuals)
     normal[:, diagonal, diagonal] += prior + 1e-9
     return parameters, residuals, jacobian, normal
@@ -190,21 +208,27 @@ def _normal_equations(
 
 def _seen_noise(influence: FloatArray, noise: FloatArray) -> FloatArray:
     """Covariance (k, 2, 2) of the centre from white noise of sd ``noise``."""
-    covariance: FloatArray = influence @ influence.transpose(0, 2, 1) * noise[:, None, None] ** 2
-    return covariance
+    return np.asarray(influence @ influence.transpose(0, 2, 1) * noise[:, None, None] ** 2)
 
 
 def _seen_structure(
-    influence: FloatArray, residuals: FloatArray, distance: FloatArray, usable: BoolArray, noise: FloatArray
+    influence: FloatArray, residuals: FloatArray, radius: int, near: BoolArray, noise: FloatArray
 ) -> FloatArray:
-    """Covariance (k, 2, 2) of the centre from the structure left about the blob, as a field correlated over a streak."""
-    near = usable & (distance > STRUCTURE_REACH_PX[0]) & (distance < STRUCTURE_REACH_PX[1])
+    """Covariance (k, 2, 2) of the centre from the structure left about the blob, as a field correlated over a streak.
+
+    Args:
+        influence: (k, 2, p) derivative of the centre with respect to each pixel of the disc.
+        residuals: (k, p) what the fit leaves.
+        radius: of the window, px.
+        near: (k, p) where the structure is measured.
+        noise: (k,) sd of the pixel noise, which is no structure.
+    """
     mean_square = (residuals**2 * near).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
     variance = np.maximum(mean_square - noise**2, 0.0)
-    k, _, p = influence.shape
-    n = int(np.sqrt(p))
+    n = 2 * radius + 1
     index = np.arange(n)
     correlation = np.exp(-0.5 * ((index[:, None] - index) / STRUCTURE_LENGTH_PX) ** 2)
-    field = (correlation @ influence.reshape(k, 2, n, n) @ correlation).reshape(k, 2, p)
-    covariance: FloatArray = influence @ field.transpose(0, 2, 1) * variance[:, None, None]
-    return covariance
+    square = np.zeros((len(influence), 2, n * n))
+    square[:, :, disc(radius)] = influence
+    field = (correlation @ square.reshape(-1, 2, n, n) @ correlation).reshape(square.shape)
+    return np.asarray(square @ field.transpose(0, 2, 1) * variance[:, None, None])

@@ -1,4 +1,4 @@
-"""Where a spot could be: local maxima that stand out of a ring about them. Cheap, generous, measured in pixels alone."""
+"""Where a spot could be: local maxima that stand out of the rings about them. Cheap and generous."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ctreg_cli.imaging.window import UprightImage, nan_quantile
 
 #: side of the blocks whose least value is the first, generous background, px
 BLOCK_PX = 16
-#: samples on each ring
-RING_SAMPLES = 16
+#: samples on each ring, and each ring's radius over the last one's
+RING_SAMPLES, RING_RATIO = 16, 1.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +35,7 @@ class Peaks:
 
 
 def smoothed(image: NDArray[Any]) -> NDArray[Any]:
-    """Binomial 3 × 3 mean over the last two axes; the outermost pixels stay as they are, NaN count as the least value."""
+    """Binomial 3 × 3 mean over the last two axes; the outermost pixels stay as they are, NaN become the least value."""
     if np.isnan(image.min(initial=0)):
         image = np.where(np.isnan(image), np.nanmin(image, initial=np.inf), image)
     out = image.copy()
@@ -49,45 +49,50 @@ def smoothed(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def local_maxima(smooth: NDArray[Any]) -> BoolArray:
-    """Pixels not lower than their 8 neighbours (last two axes); of a flat top only the last in reading order."""
-    maxima = np.zeros(smooth.shape, dtype=bool)
+    """Pixels not lower than their 8 neighbours (last two axes); of a flat top only the first in reading order."""
     inner = smooth[..., 1:-1, 1:-1]
-    result = np.ones(inner.shape, dtype=bool)
     rows, columns = smooth.shape[-2:]
-    for dr, dc in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-        neighbour = smooth[..., 1 + dr : rows - 1 + dr, 1 + dc : columns - 1 + dc]
-        result &= inner > neighbour if (dr, dc) > (0, 0) else inner >= neighbour
-    maxima[..., 1:-1, 1:-1] = result
+    highest = np.ones(inner.shape, dtype=bool)
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        highest &= inner > smooth[..., 1 - dr : rows - 1 - dr, 1 - dc : columns - 1 - dc]
+        highest &= inner >= smooth[..., 1 + dr : rows - 1 + dr, 1 + dc : columns - 1 + dc]
+    maxima = np.zeros(smooth.shape, dtype=bool)
+    maxima[..., 1:-1, 1:-1] = highest
     return maxima
 
 
 def image_noise(image: NDArray[Any]) -> float:
-    """Sd of the pixel noise of a whole image by the median Laplacian of every fourth row; flat (clipped) air left out."""
-    inner = image[1:-1:4, 1:-1]
-    laplacian = 4 * inner - image[:-2:4, 1:-1] - image[2::4, 1:-1] - image[1:-1:4, :-2] - image[1:-1:4, 2:]
+    """Sd of the pixel noise of an image by the median Laplacian of every eighth row; flat (clipped) air is left out."""
+    inner = image[1:-1:8, 1:-1]
+    laplacian = 4 * inner - image[:-2:8, 1:-1] - image[2::8, 1:-1] - image[1:-1:8, :-2] - image[1:-1:8, 2:]
     size = np.abs(laplacian[np.isfinite(laplacian) & (laplacian != 0)])
     return float(1.4826 * np.median(size) / np.sqrt(20.0)) if size.size else 0.0
 
 
-def above_blocks(smooth: NDArray[Any], margin: float) -> BoolArray:
-    """Pixels more than ``margin`` above the least value of their block."""
+def maxima_above(smooth: NDArray[Any], margin: float) -> tuple[IntArray, IntArray]:
+    """Rows and columns of local maxima that stand more than ``margin`` above the least value of their block."""
     rows, columns = smooth.shape
     pad = (-rows % BLOCK_PX, -columns % BLOCK_PX)
     padded = np.pad(smooth, ((0, pad[0]), (0, pad[1])), mode="edge") if any(pad) else smooth
-    strips = padded.reshape(-1, BLOCK_PX, padded.shape[1]).min(axis=1)
-    least = strips.reshape(len(strips), -1, BLOCK_PX).min(axis=2)
-    limit = np.repeat(np.repeat(least + smooth.dtype.type(margin), BLOCK_PX, axis=0), BLOCK_PX, axis=1)
-    above: BoolArray = smooth > limit[:rows, :columns]
-    return above
+    blocks = padded.reshape(padded.shape[0] // BLOCK_PX, BLOCK_PX, padded.shape[1] // BLOCK_PX, BLOCK_PX)
+    limit = blocks.min(axis=1).min(axis=2) + smooth.dtype.type(margin)
+    above = (blocks > limit[:, None, :, None]).reshape(padded.shape)[:rows, :columns]
+    above[[0, -1]] = above[:, [0, -1]] = False
+    at = np.flatnonzero(above)
+    flat = smooth.ravel()
+    for step in (1, columns, columns + 1, columns - 1):
+        at = at[(flat[at] > flat[at - step]) & (flat[at] >= flat[at + step])]
+    return np.divmod(at, columns)
 
 
 def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_half_width: float) -> Peaks:
     """Contrast and half width of peaks ``pixels`` (k, 2) of smoothed values ``heights`` (k,), from rings about them.
 
-    On each ring the 75th percentile counts: a plate, a streak or a long spot crosses only a smaller part of it, while an
+    On each ring the 75th percentile counts: a plate, a streak or a long spot crosses a smaller part of it, while an
     edge or the inside of something large fills it. The background is the darkest ring.
     """
-    radii = np.arange(1.0, np.ceil(max_half_width) + 4.0)
+    steps = np.arange(np.ceil(np.log(max_half_width + 3.0) / np.log(RING_RATIO)) + 1)
+    radii = np.unique(np.rint(RING_RATIO**steps))
     angles = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
     columns = np.rint(radii[:, None] * np.cos(angles)).astype(np.intp)
     rows = np.rint(radii[:, None] * np.sin(angles)).astype(np.intp)

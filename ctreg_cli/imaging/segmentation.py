@@ -1,21 +1,25 @@
 """Spots of a slice: every bright (or dark) place that a rod could have left, best first, each with its covariance.
 
-No threshold is in Hounsfield units and no size is fixed: contrast is judged against the surroundings and the noise of the
-image itself, sizes against the field of view, or against the rods and the slab where these are known. Recall goes before
-precision: clutter costs the matcher a little time, a lost rod costs the pose.
+No threshold is in Hounsfield units and no size is fixed: contrast is judged against the surroundings and the noise of
+the image itself, sizes against the field of view, or against the rods and the slab where these are known. Recall goes
+before precision: clutter costs the matcher a little time, a lost rod costs the pose.
+
+The way of the data: local maxima (:mod:`.peaks`) → half-height blobs in windows (:mod:`.blob`) → what is no spot is
+sorted out, the rest ranked → centres and covariances (:mod:`.localisation`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import Blobs, measure_blobs
-from ctreg_cli.imaging.localisation import fit_centres
-from ctreg_cli.imaging.peaks import Peaks, above_blocks, image_noise, local_maxima, rate_peaks, smoothed
+from ctreg_cli.imaging.localisation import Centres, fit_centres
+from ctreg_cli.imaging.peaks import Peaks, image_noise, local_maxima, maxima_above, rate_peaks, smoothed
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.imaging.window import UprightImage
@@ -43,25 +47,32 @@ class SegmentationOptions:
     max_width_of_image: float = 0.02
 
 
+DEFAULT_OPTIONS = SegmentationOptions()
+
 #: radii of the windows tried, px, until a spot fits with background about it
 WINDOW_RADII_PX = (7, 11, 17, 26)
+#: width of the strip between a spot and the edge of its window, px
+BACKGROUND_PX = 3.0
 #: blur and clipping make a spot look wider than its rod: by this factor and this many pixels
-BLOOM_FACTOR = 1.5
-BLOOM_PX = 4.0
+BLOOM_FACTOR, BLOOM_PX = 1.5, 4.0
 #: the slab blurs over more than its nominal thickness
 SLAB_FACTOR = 1.5
 #: elongation allowed where the slab thickness is unknown
 MAX_ELONGATION = 5.0
-#: candidates measured in windows, at most so many for one spot asked for: bounds the time on noise-like images
-CANDIDATES_PER_SPOT = 6
+#: the first look misses nothing that matters if the strongest spot has this share of the image's whole range
+FIRST_LOOK = 0.5
+#: smoothing lowers a sharp spot to about half: a peak is given up only below half the contrast asked of a spot
+SMOOTHING_LOSS = 0.5
+#: so many peaks are measured for one spot asked for: bounds the time on images of noise
+PEAKS_PER_SPOT = 6
 #: at most so many rejected candidates are reported
 MAX_REJECTED = 100
 
 
-def find_spots(slice_: Slice, options: SegmentationOptions = SegmentationOptions()) -> Spots:
+def find_spots(slice_: Slice, options: SegmentationOptions = DEFAULT_OPTIONS) -> Spots:
     """Spots of the whole slice, most rod-like first; what was looked at and left out is in ``rejected``.
 
-    Rejection reasons: ``low_contrast``, ``too_large``, ``too_elongated``, ``at_border``, ``too_many``.
+    Reasons there: ``low_contrast``, ``too_large``, ``too_elongated``, ``at_border``, ``too_many``.
     """
     if options.polarity == "auto":
         both = [_find(slice_, options, bright=bright) for bright in (True, False)]
@@ -70,45 +81,47 @@ def find_spots(slice_: Slice, options: SegmentationOptions = SegmentationOptions
 
 
 def measure_spots(
-    slice_: Slice,
-    uv_px: FloatArray,
-    radius_px: float | FloatArray,
-    options: SegmentationOptions = SegmentationOptions(),
+    slice_: Slice, uv_px: FloatArray, radius_px: float | FloatArray, options: SegmentationOptions = DEFAULT_OPTIONS
 ) -> Spots:
     """Spots within ``radius_px`` (a number, or (k,)) of predicted centres ``uv_px`` (k, 2), and nowhere else.
 
-    A spot near two predictions is returned once; where nothing is there, nothing is returned. Centres are the same as
-    :func:`find_spots` gives: both measure the same windows in the same way. With ``polarity="auto"`` bright is tried
-    first and dark only when nothing bright was found.
+    A spot near two predictions is returned once; where nothing is there, nothing is returned. Centres are those of
+    :func:`find_spots`: both measure the same windows in the same way. With ``polarity="auto"`` dark spots are looked
+    for only where nothing bright is found.
     """
     if options.polarity == "auto":
-        bright = _measure(slice_, uv_px, radius_px, options, bright=True)
-        return bright if len(bright) else _measure(slice_, uv_px, radius_px, options, bright=False)
+        spots = _measure(slice_, uv_px, radius_px, options, bright=True)
+        return spots if len(spots) else _measure(slice_, uv_px, radius_px, options, bright=False)
     return _measure(slice_, uv_px, radius_px, options, bright=options.polarity == "bright")
 
 
 def _prominence(spots: Spots) -> float:
-    """How strongly an image's best spots stand out."""
-    return float(np.sort(spots.contrast)[::-1][:8].sum()) if len(spots) else 0.0
+    """How strongly the best spots of an image stand out; a frame shows at least three, seldom more than a dozen."""
+    return float(np.sort(spots.contrast)[::-1][:8].sum())
 
 
 def _find(slice_: Slice, options: SegmentationOptions, *, bright: bool) -> Spots:
+    """Look at what stands out by a share of the image's whole range; look deeper only if nothing strong is there.
+
+    The second look is needed only when the strongest spot is so faint that ``min_relative_contrast`` admits spots which
+    the first look could not see.
+    """
     image = UprightImage.of(slice_, bright=bright)
     dense = image.dense()
-    noise = image_noise(dense)
     smooth = smoothed(dense)
-    maxima = local_maxima(smooth) & above_blocks(smooth, options.min_contrast_sd * noise)
-    rows, columns = np.nonzero(maxima)
     limits = _Limits.of(slice_, options)
-    peaks = rate_peaks(
-        image,
-        np.stack([columns, rows], axis=1),
-        smooth[rows, columns].astype(np.float64),
-        0.5 * limits.width_px,
-    )
-    peaks = peaks.take(peaks.contrast > max(options.min_contrast_sd * noise, 0.0))
-    peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
-    return _spots_at(image, peaks, limits, options)
+    least = SMOOTHING_LOSS * options.min_contrast_sd * image_noise(dense)
+    share = SMOOTHING_LOSS * options.min_relative_contrast
+    margin = max(least, FIRST_LOOK * share * (image.ceiling - float(smooth.min(initial=np.inf))))
+    while True:
+        rows, columns = maxima_above(smooth, margin)
+        pixels, heights = np.stack([columns, rows], axis=1), smooth[rows, columns].astype(np.float64)
+        peaks = rate_peaks(image, pixels, heights, 0.5 * limits.width_px)
+        spots = _spots_at(image, peaks.take(peaks.contrast > margin), limits, options)
+        needed = max(least, share * float(spots.contrast.max(initial=0.0)) / image.unit)
+        if margin <= needed:
+            return spots
+        margin = needed
 
 
 def _measure(
@@ -119,20 +132,21 @@ def _measure(
     usable = np.isfinite(uv).all(axis=1) & np.isfinite(radius)
     uv, radius = uv[usable], radius[usable]
     if not len(uv):
-        return Spots(uv_px=np.empty((0, 2)), covariance_px=np.empty((0, 2, 2)))
+        return _EMPTY
     image = UprightImage.of(slice_, bright=bright)
-    reach = int(np.ceil(radius.max())) + 1
+    reach = int(np.ceil(radius.max())) + 2
     middles = np.rint(uv).astype(np.intp)
     windows = smoothed(image.windows(middles, reach))
     which, rows, columns = np.nonzero(local_maxima(windows))
     pixels = middles[which] + np.stack([columns, rows], axis=1) - reach
-    near = ((pixels - uv[which]) ** 2).sum(axis=1) <= (radius[which] + 1.0) ** 2
-    pixels, heights = pixels[near], windows[which, rows, columns][near]
+    heights = windows[which, rows, columns]
+    looked_at = ((pixels - uv[which]) ** 2).sum(axis=1) <= (radius[which] + 1.0) ** 2
+    looked_at &= heights > np.median(windows, axis=(1, 2))[which]
     limits = _Limits.of(slice_, options)
-    peaks = rate_peaks(image, pixels, heights, 0.5 * limits.width_px)
-    peaks = peaks.take(peaks.contrast > 0)
-    peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
-    return _spots_at(image, peaks, limits, options)
+    peaks = rate_peaks(image, pixels[looked_at], heights[looked_at], 0.5 * limits.width_px)
+    spots = _spots_at(image, peaks.take(peaks.contrast > 0), limits, options)
+    distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2)
+    return spots.take((distance <= radius).any(axis=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,131 +159,132 @@ class _Limits:
     @classmethod
     def of(cls, slice_: Slice, options: SegmentationOptions) -> _Limits:
         scale, thickness = slice_.info.scale, slice_.info.thickness_mm
-        per_mm = 1.0 / min(scale.s_x, scale.s_y) if scale is not None else None
-        if options.rod_diameter_mm is not None and per_mm is not None:
-            width = BLOOM_FACTOR * options.rod_diameter_mm[1] * per_mm + BLOOM_PX
+        px_per_mm = 1.0 / min(scale.s_x, scale.s_y) if scale is not None else None
+        if options.rod_diameter_mm is not None and px_per_mm is not None:
+            width = BLOOM_FACTOR * options.rod_diameter_mm[1] * px_per_mm + BLOOM_PX
         else:
             width = max(options.max_width_of_image * max(slice_.stored.shape), BLOOM_PX)
-        if thickness is not None and per_mm is not None:
+        length = MAX_ELONGATION * width
+        if thickness is not None and px_per_mm is not None:
             tilt = np.radians(options.max_tilt_deg)
-            length = width / np.cos(tilt) + SLAB_FACTOR * thickness * per_mm * np.tan(tilt)
-        else:
-            length = MAX_ELONGATION * width
-        return cls(width_px=width, length_px=float(length))
+            length = float(width / np.cos(tilt) + SLAB_FACTOR * thickness * px_per_mm * np.tan(tilt))
+        return cls(width_px=width, length_px=length)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Found:
-    """Measured spots before ranking; all arrays over ``k`` spots."""
+@dataclass(slots=True, kw_only=True)
+class _Rejections:
+    """What was left out so far."""
 
-    uv_px: FloatArray
-    covariance_px: FloatArray
-    area_px: FloatArray
-    contrast: FloatArray
-    noise: FloatArray
-    major_px: FloatArray
-    minor_px: FloatArray
-    angle_rad: FloatArray
+    spots: list[RejectedSpot] = field(default_factory=list)
+
+    def add(self, uv: FloatArray | IntArray, reason: str) -> None:
+        room = MAX_REJECTED - len(self.spots)
+        self.spots += [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:room]]
 
 
 def _spots_at(image: UprightImage, peaks: Peaks, limits: _Limits, options: SegmentationOptions) -> Spots:
-    """Measure the blobs at ``peaks`` (best first), sort out what is no spot, fit and rank the rest."""
-    rejected: list[RejectedSpot] = []
-
-    def reject(uv: FloatArray, reason: str) -> None:
-        rejected.extend(RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv)
-
+    """Measure the blobs at ``peaks``, sort out what is no spot, fit and rank the rest."""
+    rejections = _Rejections()
+    peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
     large = peaks.half_width > 0.5 * limits.width_px + 1.0
-    reject(peaks.pixels[large], "too_large")
+    rejections.add(peaks.pixels[large], "too_large")
     peaks = peaks.take(~large)
-    limit = CANDIDATES_PER_SPOT * options.max_spots
-    reject(peaks.pixels[limit:], "low_contrast")
-    pending = peaks.take(np.arange(min(limit, len(peaks.pixels)))).pixels
-    found: list[_Found] = []
+    least = SMOOTHING_LOSS * options.min_relative_contrast * peaks.contrast.max(initial=0.0)
+    faint = (peaks.contrast < least) | (np.arange(len(peaks.pixels)) >= PEAKS_PER_SPOT * options.max_spots)
+    groups = _blobs(image, peaks.pixels[~faint], limits, rejections)
+    rejections.add(peaks.pixels[faint], "low_contrast")
+    if not groups:
+        return Spots(uv_px=_EMPTY.uv_px, covariance_px=_EMPTY.covariance_px, rejected=tuple(rejections.spots))
+
+    chosen = _choose(groups, options, rejections)
+    ends = np.cumsum([len(group) for group in groups])[:-1]
+    parts = [group.take(part) for group, part in zip(groups, np.split(chosen, ends), strict=True) if part.any()]
+    return _as_spots(parts, [fit_centres(part, image.ceiling) for part in parts], image.unit, options, rejections)
+
+
+def _blobs(image: UprightImage, pending: IntArray, limits: _Limits, rejections: _Rejections) -> list[Blobs]:
+    """Blobs that could be spots, grouped by size of window: the smallest that shows background about them."""
+    groups, previous = [], 0
     for radius in WINDOW_RADII_PX:
-        if not len(pending):
+        if not len(pending) or previous > 0.5 * limits.length_px + BACKGROUND_PX:
             break
+        previous = radius
         blobs = measure_blobs(image, pending, radius)
-        again = blobs.cut_off
-        pending = pending[again]
-        blobs = blobs.take(~again)
-        blobs = blobs.take(_first_of_each(blobs))
-        major, minor, _ = _axes(blobs.moments)
+        cut_off = blobs.cut_off
+        pending = pending[cut_off]
+        blobs = blobs.take(~cut_off)
+        blobs = blobs.take(np.sort(np.unique(blobs.middles, axis=0, return_index=True)[1]))  # peaks of the same blob
+        major, minor, _ = blobs.axes
         for bad, reason in (
+            (blobs.height <= 0, "low_contrast"),
             (minor > limits.width_px, "too_large"),
             (major > limits.length_px, "too_elongated"),
             (blobs.at_border, "at_border"),
-            (blobs.height <= 0, "low_contrast"),
         ):
-            reject((blobs.middles + blobs.centre)[bad], reason)
-        good = (minor <= limits.width_px) & (major <= limits.length_px) & ~blobs.at_border & (blobs.height > 0)
+            rejections.add(blobs.uv_px[bad], reason)
+        good = (blobs.height > 0) & (minor <= limits.width_px) & (major <= limits.length_px) & ~blobs.at_border
         if good.any():
-            found.append(_fit(blobs.take(good), image))
-    reject(pending.astype(np.float64), "too_large")
-    if not found:
-        return Spots(uv_px=np.empty((0, 2)), covariance_px=np.empty((0, 2, 2)), rejected=tuple(rejected[:MAX_REJECTED]))
-    spots = _joined(found)
-    return _ranked(spots, rejected, options)
+            groups.append(blobs.take(good))
+    rejections.add(pending, "too_large")
+    return groups
 
 
-def _fit(blobs: Blobs, image: UprightImage) -> _Found:
-    centres = fit_centres(blobs, image.ceiling)
-    major, minor, angle = _axes(blobs.moments)
-    return _Found(
-        uv_px=centres.uv_px,
-        covariance_px=centres.covariance_px,
-        area_px=blobs.area,
-        contrast=blobs.height * image.unit,
-        noise=centres.noise * image.unit,
-        major_px=major,
-        minor_px=minor,
-        angle_rad=angle,
-    )
+def _choose(groups: Sequence[Blobs], options: SegmentationOptions, rejections: _Rejections) -> BoolArray:
+    """Which blobs of all groups (in their order) become spots: the best, each blob once."""
+    uv = np.concatenate([group.uv_px for group in groups])
+    height = np.concatenate([group.height for group in groups])
+    major, minor = (np.concatenate([group.axes[i] for group in groups]) for i in (0, 1))
+    order = np.argsort(-_score(height, major, minor), kind="stable")
+    order = order[_apart(uv[order], minor[order])]
+    faint = height[order] < options.min_relative_contrast * height[order[0]]
+    beyond = ~faint & (np.cumsum(~faint) > options.max_spots)
+    rejections.add(uv[order[faint]], "low_contrast")
+    rejections.add(uv[order[beyond]], "too_many")
+    chosen = np.zeros(len(uv), dtype=bool)
+    chosen[order[~faint & ~beyond]] = True
+    return chosen
 
 
-def _joined(parts: list[_Found]) -> _Found:
-    return _Found(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in _Found.__slots__})
-
-
-def _ranked(found: _Found, rejected: list[RejectedSpot], options: SegmentationOptions) -> Spots:
-    """The best ``max_spots``: high contrast and round before faint and long."""
-    score = found.contrast * np.sqrt(found.minor_px / found.major_px)
-    order = np.argsort(-score, kind="stable")
-    order = order[_apart(found.uv_px[order], found.minor_px[order])]
-    contrast, noise = found.contrast[order], found.noise[order]
-    faint = (contrast < options.min_contrast_sd * noise) | (contrast < options.min_relative_contrast * contrast[0])
-    beyond = np.cumsum(~faint) > options.max_spots
-    for which, reason in ((faint, "low_contrast"), (beyond & ~faint, "too_many")):
-        rejected.extend(RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in found.uv_px[order[which]])
-    keep = order[~faint & ~beyond]
-    return Spots(
-        uv_px=found.uv_px[keep],
-        covariance_px=found.covariance_px[keep],
-        area_px=found.area_px[keep],
-        contrast=found.contrast[keep],
-        major_px=found.major_px[keep],
-        minor_px=found.minor_px[keep],
-        angle_rad=found.angle_rad[keep],
-        rejected=tuple(rejected[:MAX_REJECTED]),
-    )
-
-
-def _axes(moments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Full lengths (k,) of the axes of uniform ellipses with these second moments, px, and the long axis' angle, rad."""
-    values, vectors = np.linalg.eigh(moments)
-    minor, major = 4.0 * np.sqrt(np.maximum(values, 0.0)).T
-    angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-    return major, minor, angle
-
-
-def _first_of_each(blobs: Blobs) -> IntArray:
-    """Indices of blobs whose windows differ: several peaks of one blob lead to one window."""
-    _, first = np.unique(blobs.middles, axis=0, return_index=True)
-    return np.sort(first)
+def _score(height: FloatArray, major: FloatArray, minor: FloatArray) -> FloatArray:
+    """(k,) large for what stands out and is round."""
+    score: FloatArray = height * np.sqrt(minor / major)
+    return score
 
 
 def _apart(uv: FloatArray, width: FloatArray) -> BoolArray:
     """Which of the spots (k, 2), best first, do not lie within half a width of a better one."""
     distance = np.linalg.norm(uv[:, None] - uv[None, :], axis=2)
     close = (distance < 0.5 * np.maximum(width[:, None], width[None, :])) & np.tri(len(uv), k=-1, dtype=bool)
-    return ~close.any(axis=1)
+    apart: BoolArray = ~close.any(axis=1)
+    return apart
+
+
+def _as_spots(
+    blobs: Sequence[Blobs],
+    centres: Sequence[Centres],
+    unit: float,
+    options: SegmentationOptions,
+    rejections: _Rejections,
+) -> Spots:
+    """Blobs and their fitted centres as spots, best first, without those that the noise about them could have made."""
+    major, minor, angle = (np.concatenate([part.axes[i] for part in blobs]) for i in range(3))
+    height = np.concatenate([part.height for part in blobs])
+    noise = np.concatenate([part.noise for part in centres])
+    uv = np.concatenate([part.uv_px for part in centres])
+    order = np.argsort(-_score(height, major, minor), kind="stable")
+    faint = height[order] < options.min_contrast_sd * noise[order]
+    rejections.add(uv[order[faint]], "low_contrast")
+    keep = order[~faint]
+    return Spots(
+        uv_px=uv[keep],
+        covariance_px=np.concatenate([part.covariance_px for part in centres])[keep],
+        area_px=np.concatenate([part.area for part in blobs])[keep],
+        contrast=height[keep] * unit,
+        major_px=major[keep],
+        minor_px=minor[keep],
+        angle_rad=angle[keep],
+        rejected=tuple(rejections.spots),
+    )
+
+
+_EMPTY = Spots(uv_px=np.empty((0, 2)), covariance_px=np.empty((0, 2, 2)))

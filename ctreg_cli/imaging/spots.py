@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray, frozen
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 
 #: standard deviation (px, each coordinate) given to spots that come without one
 DEFAULT_SPOT_SD_PX = 0.25
@@ -36,7 +36,8 @@ class Spots:
     area_px: FloatArray = field(default_factory=lambda: np.empty(0))
     #: (m,) peak above the local background, in the image's units (HU)
     contrast: FloatArray = field(default_factory=lambda: np.empty(0))
-    #: (m,) full length (FWHM-like, px) along the long and the short axis, and the long axis' angle from +u towards +v (rad)
+    #: (m,) full length at half height along the long and the short axis, px, and the long axis' angle from +u towards
+    #: +v, rad
     major_px: FloatArray = field(default_factory=lambda: np.empty(0))
     minor_px: FloatArray = field(default_factory=lambda: np.empty(0))
     angle_rad: FloatArray = field(default_factory=lambda: np.empty(0))
@@ -61,6 +62,12 @@ class Spots:
         """Spots known only by their centres (m, 2), all with the same assumed standard deviation (px)."""
         uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
         return cls(uv_px=uv, covariance_px=np.tile(np.eye(2) * sd_px**2, (len(uv), 1, 1)), sd_assumed=True)
+
+    def take(self, which: BoolArray | IntArray) -> Spots:
+        """Some of the spots; the rejected candidates stay."""
+        names = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
+        arrays = {name: getattr(self, name)[which] for name in names}
+        return Spots(**arrays, sd_assumed=self.sd_assumed, rejected=self.rejected)
 
     @property
     def sd_px(self) -> FloatArray:

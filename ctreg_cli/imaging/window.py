@@ -7,12 +7,13 @@ pixels of a quarter of a million.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.imaging.slice import Slice
 
 
@@ -61,17 +62,24 @@ class UprightImage:
         return image
 
     def at(self, rows: IntArray, columns: IntArray) -> FloatArray:
-        """Values (float64) at pixels given by index arrays of one shape; NaN beyond the border and in padding."""
+        """Values (float64) at pixels given by index arrays; NaN beyond the border and in padding."""
         n_rows, n_columns = self.shape
-        outside = (rows < 0) | (rows >= n_rows) | (columns < 0) | (columns >= n_columns)
-        off_image = bool(outside.any())
-        if off_image:
-            rows, columns = np.where(outside, 0, rows), np.where(outside, 0, columns)
-        stored = self.source.stored[rows, columns]
-        values = stored.astype(np.float64) * self.sign
+        within = (
+            rows.min(initial=0) >= 0
+            and columns.min(initial=0) >= 0
+            and rows.max(initial=0) < n_rows
+            and columns.max(initial=0) < n_columns
+        )
+        flat = rows * n_columns + columns
+        outside = None
+        if not within:
+            outside = (rows < 0) | (rows >= n_rows) | (columns < 0) | (columns >= n_columns)
+            flat[outside] = 0
+        stored = self.source.stored.ravel().take(flat)  # one flat index costs half of a pair
+        values: FloatArray = stored * self.sign
         if self.source.padding is not None:
             values[self.source.is_padding(stored)] = np.nan
-        if off_image:
+        if outside is not None:
             values[outside] = np.nan
         return values
 
@@ -80,31 +88,42 @@ class UprightImage:
         offset = np.arange(-radius, radius + 1)
         rows = centres[:, 1, None, None] + offset[:, None]
         columns = centres[:, 0, None, None] + offset[None, :]
-        return self.at(*np.broadcast_arrays(rows, columns))
+        return self.at(rows, columns)
 
 
+@cache
 def grid(radius: int) -> tuple[FloatArray, FloatArray]:
     """Coordinates (u, v), each (n, n), of a window's pixels from its middle one, px."""
     offset = np.arange(-radius, radius + 1, dtype=np.float64)
     u, v = np.meshgrid(offset, offset)
-    return u, v
+    return frozen(u, u.shape), frozen(v, v.shape)
+
+
+@cache
+def disc(radius: int) -> IntArray:
+    """Flat indices (p,) of the pixels of a window within its radius: its corners carry nothing but neighbours."""
+    u, v = grid(radius)
+    return frozen_index(np.flatnonzero(np.hypot(u, v) <= radius + 0.5))
+
+
+@cache
+def ring(radius: int) -> IntArray:
+    """Flat indices (p,) of the outermost two pixels of that disc: where the background is seen."""
+    u, v = grid(radius)
+    r = np.hypot(u, v)
+    return frozen_index(np.flatnonzero((r > radius - 2) & (r <= radius + 0.5)))
 
 
 def nan_quantile(values: FloatArray, q: float) -> FloatArray:
-    """Quantile (k,) over the last axis of (k, n), NaN ignored; NaN where nothing is left (rounded to a sample)."""
-    ordered = np.sort(values, axis=-1)  # NaN go last
-    count = np.isfinite(ordered).sum(axis=-1)
+    """Quantile over the last axis of (..., n), rounded to a sample, NaN ignored; NaN where nothing is left."""
+    count = np.isfinite(values).sum(axis=-1)
+    n = values.shape[-1]
+    if (count == n).all():
+        index = round(q * (n - 1))
+        return np.asarray(np.partition(values, index, axis=-1)[..., index])
     index = np.rint(q * np.maximum(count - 1, 0)).astype(np.intp)
-    result: FloatArray = np.take_along_axis(ordered, index[..., None], axis=-1)[..., 0]
-    return result
-
-
-def ring(radius: int) -> BoolArray:
-    """The outermost two pixels (n, n) of the disc in a window: where the background is seen."""
-    u, v = grid(radius)
-    r = np.hypot(u, v)
-    inside: BoolArray = (r > radius - 2) & (r <= radius + 0.5)
-    return inside
+    ordered = np.sort(values, axis=-1)  # NaN go last
+    return np.asarray(np.take_along_axis(ordered, index[..., None], axis=-1)[..., 0])
 
 
 def dilated(mask: BoolArray) -> BoolArray:
