@@ -24,7 +24,7 @@ BLOCK_MARGIN_MM, WALL_MM, SOLID_BLOCK_MM = 2.5, 8.0, 150.0
 #: between the frame and the body
 BODY_GAP_MM = 5.0
 #: layers through the slab when a block is averaged
-BLOCK_LAYERS = 8
+BLOCK_LAYERS = 4
 
 #: streaks: width of the dark band between two rods and where it is cut (in standard deviations), how fast streaks
 #: fade, how far they reach, and the width of a rod that has no rays in it, mm
