@@ -25,7 +25,7 @@ MIN_TWIN_MM = 0.3
 #: a frame that does worse than this where most rods are seen deserves a remark
 WEAK_ROTATION_DEG = 2.0
 #: triples of rods grow with the cube of their number: no listing of sets and symmetries beyond this
-MAX_RODS_LISTED = 100
+MAX_RODS_LISTED = 50
 #: from this number of rods on, a slice has redundancy to speak of (method §7)
 REDUNDANT_RODS = 5
 
@@ -121,7 +121,7 @@ def _remarks(
     model: RodModel, twins: Iterable[Symmetry], linear_rank: int, quality: tuple[SliceQuality, ...]
 ) -> Iterator[str]:
     if len(model) > MAX_RODS_LISTED:
-        yield f"more than {MAX_RODS_LISTED} rods: sets are listed among the first {MAX_RODS_LISTED}, symmetries not at all"
+        yield f"{len(model)} rods: sets are listed among the first {MAX_RODS_LISTED} only, symmetries not at all"
     for i, j in coincident_pairs(model):
         yield f"rods {model.ids[i]} and {model.ids[j]} lie on one line, one over the other: written twice?"
     for twin in twins:
