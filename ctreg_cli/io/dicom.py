@@ -57,6 +57,8 @@ _UIDS = {
     "study_instance": "StudyInstanceUID",
     "frame_of_reference": "FrameOfReferenceUID",
 }
+#: of a file that broke off before it said which series it is of
+_LOST = SeriesKey(None, Kind.SLICE, "")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,20 +82,19 @@ def read_dicom(path: Path, source: str) -> list[ImageRecord] | NotAnImage:
         A record a frame, in the file's order. A file that cannot be used is one record with a ``problem``.
     """
     info = SliceInfo(source=source)
-    lost = SeriesKey(None, Kind.SLICE, "")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what pydicom finds odd is either checked here or harmless
         try:
             with open_binary(path) as file:
                 return _read(path, source, file)
         except HeaderProblem as error:
-            return [ImageRecord(info=info, series=lost, problem=str(error))]
+            return [ImageRecord(info=info, series=_LOST, problem=str(error))]
         except RecursionError:
-            return [ImageRecord(info=info, series=lost, problem="its sequences are nested too deeply")]
+            return [ImageRecord(info=info, series=_LOST, problem="its sequences are nested too deeply")]
         # The one door for hostile files. Walking through damaged elements, pydicom raises struct.error, EOFError,
         # OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, OverflowError and more.
         except Exception:  # noqa: BLE001
-            return [ImageRecord(info=info, series=lost, problem="its header is damaged")]
+            return [ImageRecord(info=info, series=_LOST, problem="its header is damaged")]
 
 
 def _read(path: Path, source: str, file: BinaryIO) -> list[ImageRecord] | NotAnImage:
@@ -108,6 +109,8 @@ def _read(path: Path, source: str, file: BinaryIO) -> list[ImageRecord] | NotAnI
         return _records(path, source, header, series)
     except HeaderProblem as error:  # which series it belongs to, and when it was taken, is known all the same
         info = SliceInfo(source=source, uids=_uids(header.elements))
+        if "series_instance" not in info.uids:
+            series = _LOST
         return [_with_place(ImageRecord(info=info, series=series, problem=str(error)), header)]
 
 

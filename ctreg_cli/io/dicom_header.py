@@ -10,7 +10,7 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -177,7 +177,7 @@ class Elements:
                 element.VR == "UN"
             )  # whoever passed it on did not know it, and left it in implicit VR (PS3.5 6.2.2)
             value = convert_SQ(value, element.is_implicit_VR or unknown, element.is_little_endian or unknown)
-        return [Elements({e.tag: e for e in item.elements()}, self.little_endian) for item in value]
+        return [Elements(_whole(item.elements()), self.little_endian) for item in value]
 
     def _one(self, keyword: str, value: bytes, code: str) -> int:
         numbers = self._unpack(keyword, value, code)
@@ -306,7 +306,7 @@ def inflate(file: BinaryIO, limit: int) -> tuple[bytes, bool]:
 def _file_meta(file: BinaryIO) -> Elements:
     """Group 0002, always explicit VR little endian; leaves the file at the first element after it."""
     walk = data_element_generator(file, False, True, stop_when=lambda tag, vr, length: tag >> 16 != 2)
-    return Elements({element.tag: element for element in walk}, True)
+    return Elements(_whole(walk), True)
 
 
 def _guess_encoding(file: BinaryIO) -> tuple[bool, bool]:
@@ -329,8 +329,12 @@ def _walk(file: BinaryIO, implicit: bool, little: bool) -> tuple[dict[int, Any],
         return True
 
     walk = data_element_generator(file, implicit, little, stop_when=at_pixels, specific_tags=_TOP_LEVEL_TAGS)
-    elements = {element.tag: element for element in walk}
-    return elements, found[0] if found else None
+    return _whole(walk), found[0] if found else None
+
+
+def _whole(elements: Iterable[Any]) -> dict[int, Any]:
+    """By tag, without values cut off by the end of the file or sequence: half a number is another number."""
+    return {e.tag: e for e in elements if not isinstance(e.value, bytes) or len(e.value) == e.length}
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """The pixels of a DICOM image: checked against the file before anything is allocated, read one frame at a time.
 
-Uncompressed frames are read straight from their place in the file. Compressed ones go to pydicom's decoders, after the
-size written in the codestream itself was compared with Rows and Columns: no decoder is let loose on an image whose size
-nobody agreed to.
+Uncompressed frames are read straight from their place in the file. Compressed ones go to pydicom's decoders (see
+:mod:`ctreg_cli.io.dicom_decoding`) after the size written in the codestream itself was compared with Rows and Columns:
+no decoder is let loose on an image whose size nobody agreed to.
 """
 
 from __future__ import annotations
@@ -10,14 +10,12 @@ from __future__ import annotations
 import struct
 import warnings
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydicom.encaps import encapsulate, get_frame
-from pydicom.pixels import get_decoder
+from pydicom.encaps import get_frame
 from pydicom.uid import (
     UID,
     DeflatedExplicitVRLittleEndian,
@@ -33,6 +31,7 @@ from pydicom.uid import (
 )
 
 from ctreg_cli.errors import UnreadableSliceError
+from ctreg_cli.io.dicom_decoding import codec_available, decode
 from ctreg_cli.io.dicom_header import (
     Elements,
     Header,
@@ -275,12 +274,6 @@ def _locate_encapsulated(path: Path, header: Header, element: PixelElement, layo
     ]
 
 
-@lru_cache(maxsize=32)
-def codec_available(transfer_syntax: str) -> bool:
-    """Whether a decoder for this compression is installed."""
-    return bool(get_decoder(transfer_syntax).is_available)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NativePixels:
     """An uncompressed frame at a known place of a file."""
@@ -353,48 +346,41 @@ class EncapsulatedPixels:
     extended_offsets: tuple[bytes, bytes] | None
 
     def load(self) -> NDArray[Any]:
-        """Decode the frame."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                stored = self._decode()
-            except HeaderProblem as error:
-                raise UnreadableSliceError(str(error)) from None
-            # the door to the decoders: a damaged codestream makes them raise whatever they like
-            except Exception:  # noqa: BLE001
-                raise UnreadableSliceError(
-                    f"{tag_name('PixelData')} cannot be decoded: damaged, or of a kind unknown to the decoders"
-                ) from None
-        stored.flags.writeable = False
-        return stored
-
-    def _decode(self) -> NDArray[Any]:
+        """Decode the frame; the array is read-only."""
         layout = self.layout
-        with open_binary(Path(self.path)) as file:
-            file.seek(self.offset)
-            codestream = get_frame(
-                file, self.frame, number_of_frames=layout.n_frames, extended_offsets=self.extended_offsets
-            )
+        codestream = self._codestream()
         shape = codestream_shape(codestream)
         if self.transfer_syntax != RLELossless and shape != (layout.rows, layout.columns):
-            raise problem("PixelData", "holds a codestream of another size than Rows × Columns, or a damaged one")
-        _silence_gdcm()
-        stored, _ = get_decoder(self.transfer_syntax).as_array(
-            encapsulate([codestream], has_bot=False),
-            index=0,
-            raw=True,
-            rows=layout.rows,
-            columns=layout.columns,
-            number_of_frames=1,
-            samples_per_pixel=1,
-            photometric_interpretation="MONOCHROME2",
-            bits_allocated=layout.bits_allocated,
-            bits_stored=layout.bits_stored,
-            pixel_representation=int(layout.signed),
-            pixel_keyword="PixelData",
-        )
-        result: NDArray[Any] = stored
-        return result
+            what = "holds a codestream of another size than Rows × Columns, or a damaged one"
+            raise UnreadableSliceError(f"{tag_name('PixelData')} {what}")
+        try:
+            return decode(
+                codestream,
+                transfer_syntax=self.transfer_syntax,
+                dtype=layout.dtype,
+                rows=layout.rows,
+                columns=layout.columns,
+                bits_allocated=layout.bits_allocated,
+                bits_stored=layout.bits_stored,
+                pixel_representation=int(layout.signed),
+            )
+        except UnreadableSliceError as error:
+            raise UnreadableSliceError(f"{tag_name('PixelData')} {error}") from None
+
+    def _codestream(self) -> bytes:
+        try:
+            with open_binary(Path(self.path)) as file, warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                file.seek(self.offset)
+                codestream: bytes = get_frame(
+                    file, self.frame, number_of_frames=self.layout.n_frames, extended_offsets=self.extended_offsets
+                )
+        except HeaderProblem as error:
+            raise UnreadableSliceError(str(error)) from None
+        # damaged item headers and offset tables; pydicom raises ValueError, struct.error, EOFError, StopIteration, ...
+        except Exception:  # noqa: BLE001
+            raise UnreadableSliceError(f"{tag_name('PixelData')} has a damaged encapsulation") from None
+        return codestream
 
 
 def codestream_shape(codestream: bytes) -> tuple[int, int] | None:
@@ -431,14 +417,3 @@ def _finished(stored: NDArray[Any], layout: Layout) -> NDArray[Any]:
             stored = np.right_shift(np.left_shift(stored, unused), unused)
     stored.flags.writeable = False
     return stored
-
-
-@lru_cache(maxsize=1)
-def _silence_gdcm() -> None:
-    """GDCM writes its complaints straight to standard error."""
-    try:
-        import gdcm
-    except ImportError:
-        return
-    for off in (gdcm.Trace.DebugOff, gdcm.Trace.WarningOff, gdcm.Trace.ErrorOff):
-        off()

@@ -26,10 +26,10 @@ DAY_S = 86_400.0
 MAX_SERIES_SPAN_S = DAY_S / 2
 
 # HHMMSS.FFFFFF, right end optional; the colons are ACR-NEMA's
-_TIME = re.compile(r"(\d\d)(?::?(\d\d)(?::?(\d\d(?:\.\d{0,6})?))?)?")
-_DATE = re.compile(r"(\d{4})\.?(\d\d)\.?(\d\d)")
+_TIME = re.compile(r"(\d\d)(?::?(\d\d)(?::?(\d\d(?:\.\d{0,6})?))?)?", re.ASCII)
+_DATE = re.compile(r"(\d{4})\.?(\d\d)\.?(\d\d)", re.ASCII)
 # YYYYMMDDHHMMSS.FFFFFF&ZZXX; a time needs at least the hour
-_DATE_TIME = re.compile(r"(\d{8})(\d\d(?:\d\d(?:\d\d(?:\.\d{0,6})?)?)?)(?:[+-]\d{4})?")
+_DATE_TIME = re.compile(r"(\d{8})(\d\d(?:\d\d(?:\d\d(?:\.\d{0,6})?)?)?)(?:[+-]\d{4})?", re.ASCII)
 
 
 def read_clock(elements: Elements, frame: Elements | None = None) -> tuple[Instant | None, ...]:
