@@ -33,7 +33,7 @@ def track(
     \b
     Examples:
       ctreg track slices/ -m frame.yaml -o track.csv
-      ctreg track slices/ -m frame.yaml -c calibration.yaml --jacobian constant --gain 0.5 -o track.jsonl
+      ctreg track slices/ -m frame.yaml --jacobian constant -o track.jsonl
     """
     from dataclasses import asdict
 

@@ -161,14 +161,20 @@ class _SliceRows:
 
 def _parse_json(text: str, name: str) -> list[SliceRecord]:
     head, *lines = text.strip().splitlines()
+    in_lines = _is_header_line(head)
     try:
-        if _is_header_line(head):
+        if in_lines:
             # as one list, in which line n is line n of the file
             return _SLICES.validate_json("[\n" + ",\n".join(lines) + "]", strict=True)
         return list(SpotsDocument.model_validate_json(text, strict=True).slices)
     except ValidationError as error:
-        mistakes = error.errors()
-        raise _error([f"{name}: {_sentence(mistake, mistake['loc'])}" for mistake in mistakes]) from error
+        mistakes = []
+        for mistake in error.errors():
+            place, inside = name, mistake["loc"]
+            if in_lines and inside:
+                place, inside = f"{name}:{int(inside[0]) + 2}", inside[1:]
+            mistakes.append(f"{place}: {_sentence(mistake, inside)}")
+        raise _error(mistakes) from error
 
 
 def _is_header_line(line: str) -> bool:

@@ -18,6 +18,8 @@ from ctreg_cli.scale import Scale
 MAX_COORDINATE_PX = 1e6
 #: a standard deviation below this (px) is no measurement, but would outweigh every other spot
 MIN_SD_PX = 1e-6
+#: relative asymmetry of a covariance that is no mistake
+ROUNDING = 1e-9
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
 Sd = Annotated[float, Field(ge=MIN_SD_PX, le=MAX_COORDINATE_PX)]
@@ -59,8 +61,9 @@ class SpotRecord(_Record):
         covariance = self.covariance()
         if covariance is None:
             return self
-        symmetric = covariance[0, 1] == covariance[1, 0]
-        if not symmetric or np.linalg.eigvalsh(covariance)[0] < MIN_SD_PX**2 / 2:
+        # a computed matrix may miss symmetry by its last bits
+        is_symmetric = abs(covariance[0, 1] - covariance[1, 0]) <= ROUNDING * np.trace(covariance)
+        if not is_symmetric or np.linalg.eigvalsh(covariance)[0] < MIN_SD_PX**2 / 2:
             raise _mistake("covariance: must be symmetric and positive definite")
         return self
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -267,6 +268,30 @@ def test_the_same_output_twice_is_refused(tmp_path: Path) -> None:
     path = str(tmp_path / "a.csv")
     with pytest.raises(InputError, match="twice"):
         open_sinks([path, path], results_encoding(HEADER), None)  # type: ignore[arg-type]
+
+
+class LeftReader(io.StringIO):
+    """Standard output whose reader leaves after two flushes."""
+
+    patience = 2
+
+    def flush(self) -> None:
+        if not self.closed and self.patience <= 0:
+            raise BrokenPipeError
+        self.patience -= 1
+
+
+def test_a_reader_that_leaves_takes_no_other_output_away(tmp_path: Path, results: list[FrameResult]) -> None:
+    write_results(results, tmp_path / "wanted.csv", HEADER)
+    with open_sinks(["-", str(tmp_path / "p.csv")], results_encoding(HEADER), LeftReader()) as sinks:
+        for result in results:
+            sinks.write(result)
+            assert sinks.alive
+    assert (tmp_path / "p.csv").read_bytes() == (tmp_path / "wanted.csv").read_bytes()
+    with open_sinks(["-"], results_encoding(HEADER), LeftReader()) as sinks:
+        for result in results[:3]:
+            sinks.write(result)
+        assert not sinks.alive
 
 
 def test_a_link_keeps_pointing_where_it_did(tmp_path: Path, results: list[FrameResult]) -> None:

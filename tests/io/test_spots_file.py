@@ -228,6 +228,7 @@ def test_spots_left_out_are_numbered_anew_and_it_is_said() -> None:
         ('{"schema": "ctreg/spots/1", "slices": [{"slice": 0, "spots": [{"u_px": 1}]}]}', r"slices\.0\.spots\.0\.v_px"),
         ('{"schema": "ctreg/spots/1", "slices": [{"slice": 0,', r"t: .*JSON.*EOF"),
         ('{"schema": "ctreg/spots/1"}\n{"slice": 0}\n{"slice": 1,', r"t: .*line 3"),
+        ('{"schema": "ctreg/spots/1"}\n{"slice": 0}\n{"slice": -1}', r"t:3: slice: .*greater than or equal to 0"),
         ("[" * 100_000, r"t: .*recursion"),
         (
             '{"schema": "ctreg/spots/1", "slices": [{"slice": 0, "T_patient_slice": ' + f"{MIRROR}}}]}}",
