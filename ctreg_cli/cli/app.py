@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from typing import Annotated, Any
@@ -20,6 +21,9 @@ class CtregGroup(TyperGroup):
     """Runs a command; what it raises on purpose becomes one message and an exit code, never a traceback."""
 
     def invoke(self, ctx: typer.Context) -> Any:  # type: ignore[override]
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            # data is UTF-8 wherever it goes, also where the console is not
+            sys.stdout.reconfigure(encoding="utf-8")
         try:
             return super().invoke(ctx)
         except EstimationError as error:

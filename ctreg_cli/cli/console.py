@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -27,9 +28,11 @@ def counted(counts: Mapping[str, int]) -> str:
 class Talk:
     """Summary, progress and warnings, as loud as the user wants."""
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+    def __init__(self, *, quiet: bool = False, verbose: bool = False, outputs: Sequence[str] = ()) -> None:
         self.quiet = quiet
         self.verbose = verbose and not quiet
+        #: rows on the same screen as a bar would tear it to pieces
+        self._rows_on_screen = "-" in outputs and sys.stdout.isatty()
         self._console: Console | None = None
 
     @property
@@ -57,12 +60,12 @@ class Talk:
 
     def progress(self, items: Iterable[Item], *, total: int | None, what: str) -> Iterator[Item]:
         """The items, with a bar while they pass; only where standard error is a terminal."""
-        if self.quiet or not self.console.is_terminal:
+        if self.quiet or self._rows_on_screen or not self.console.is_terminal:
             yield from items
             return
         from rich.progress import Progress
 
-        with Progress(console=self.console, transient=True) as bar:
+        with Progress(console=self.console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
             yield from bar.track(items, total=total, description=what)
 
     def table(self, rows: Sequence[tuple[str, str]]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,14 +26,22 @@ class OverlayWriter:
     """Draws slices with what was found in them into a folder, which is made if need be.
 
     Raises:
-        InputError: the input has no pixels, or the folder cannot be made.
+        InputError: the input has no pixels, the folder is an input, or it cannot be made.
     """
 
     def __init__(
-        self, folder: str, source: Source, *, model: RodModel | None = None, scale: Scale | None = None
+        self,
+        folder: str,
+        source: Source,
+        inputs: Sequence[str],
+        *,
+        model: RodModel | None = None,
+        scale: Scale | None = None,
     ) -> None:
         if source.kind != "images":
             raise InputError(f"--overlay {folder}: a spots file has no pixels to draw on; give the images")
+        if Path(folder).resolve() in {Path(name).resolve() for name in inputs}:
+            raise InputError(f"--overlay {folder}: is an input; pictures among slices would be taken for slices")
         self._folder, self._model, self._scale = Path(folder), model, scale
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -55,15 +55,15 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
         CtregError: the model, the input, the scale or an output cannot be used.
         typer.Exit: code 1 when not one slice gave a pose, or with ``strict`` when any slice is not ``ok``.
     """
-    talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose)
-    outputs = check_outputs(arguments.output)
+    outputs = check_outputs(arguments.output, arguments.inputs)
+    talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose, outputs=outputs)
     model = load_rod_model(arguments.model)
     source = open_inputs(arguments.inputs, talk, series=arguments.series, spot_sd_px=arguments.spot_sd)
     scale = choose_scale(arguments.scale, arguments.calibration, source, model, talk)
     segmentation = SegmentationOptions(polarity=arguments.polarity.value)
     overlays = None
     if arguments.overlay:
-        overlays = OverlayWriter(arguments.overlay, source, model=model, scale=scale.scale)
+        overlays = OverlayWriter(arguments.overlay, source, arguments.inputs, model=model, scale=scale.scale)
     header = ResultsHeader(
         model=model,
         scale=scale.scale,

@@ -39,15 +39,15 @@ def segment(
     from ctreg_cli.io.spots_file import numbered, spots_encoding
     from ctreg_cli.pipeline import segment as segment_slices
 
-    talk = Talk(quiet=quiet, verbose=verbose)
-    outputs = check_outputs(output)
+    outputs = check_outputs(output, inputs)
+    talk = Talk(quiet=quiet, verbose=verbose, outputs=outputs)
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     segmentation = SegmentationOptions(polarity=polarity.value)
     overlays = None
     if overlay:
         from ctreg_cli.cli.overlays import OverlayWriter
 
-        overlays = OverlayWriter(overlay, source)
+        overlays = OverlayWriter(overlay, source, inputs)
     encoding = spots_encoding(options={"command": "segment", **asdict(segmentation)}, with_uids=with_uids)
     sinks = open_sinks(outputs, encoding, sys.stdout)
     watched, tally = Watched(source, talk), SpotTally()

@@ -272,11 +272,11 @@ def format_of(output: str) -> str:
     return suffix
 
 
-def check_outputs(outputs: Sequence[str] | None) -> list[str]:
+def check_outputs(outputs: Sequence[str] | None, inputs: Sequence[str] = ()) -> list[str]:
     """The values of ``-o``, ``-`` when there are none; to be called before any work is done.
 
     Raises:
-        InputError: an unknown suffix, the same output twice, or a folder that does not exist.
+        InputError: an unknown suffix, the same output twice, one that is an input, or a folder that does not exist.
     """
     outputs = list(outputs or [STANDARD_OUTPUT])
     for output in outputs:
@@ -286,6 +286,9 @@ def check_outputs(outputs: Sequence[str] | None) -> list[str]:
         check_folder(file)
     if len({file.resolve() for file in files}) < len(files) or outputs.count(STANDARD_OUTPUT) > 1:
         raise InputError(f"-o {' -o '.join(outputs)}: the same output twice")
+    for file in files:
+        if file.resolve() in {Path(name).resolve() for name in inputs}:
+            raise InputError(f"-o {file}: is an input, and would be replaced; name another file")
     return outputs
 
 

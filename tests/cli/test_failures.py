@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import ctreg_cli
 from ctreg_cli.io.results import read_results
+from ctreg_cli.io.spots_file import read_spots
 from tests.cli.conftest import FRAME, SAMPLES, run_ctreg
 
 
@@ -141,6 +144,24 @@ def test_an_earlier_output_survives_a_failed_run(bare_spots: Path, tmp_path: Pat
         assert earlier.read_text(encoding="utf-8") == "earlier"
 
 
+def test_an_input_is_never_an_output(spots_csv: Path, two_slices: Path, tmp_path: Path) -> None:
+    before = spots_csv.read_bytes()
+    assert_refused("pose", spots_csv, "-m", FRAME, "-o", spots_csv, say="is an input")
+    assert_refused("pose", two_slices, "-m", FRAME, "--overlay", two_slices, say="is an input")
+    assert spots_csv.read_bytes() == before
+
+
+def test_a_file_name_that_is_no_unicode_is_written_as_unicode(two_slices: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    shutil.copy(two_slices / "track_000.dcm", os.fsencode(folder) + b"/m\xe9tal.dcm")
+    for suffix in (".csv", ".json", ".jsonl"):
+        spots = tmp_path / f"s{suffix}"
+        run_ctreg("segment", folder, "-o", spots, "-v")
+        assert [spot_slice.info.source for spot_slice in read_spots(spots)] == ["m\ufffdtal.dcm"]
+        run_ctreg("pose", spots, "-m", FRAME, "-v")
+
+
 def test_quiet_says_nothing_and_verbose_says_more(spots_csv: Path) -> None:
     quiet = run_ctreg("pose", spots_csv, "-m", FRAME, "-q")
     usual = run_ctreg("pose", spots_csv, "-m", FRAME)
@@ -152,7 +173,7 @@ def test_quiet_says_nothing_and_verbose_says_more(spots_csv: Path) -> None:
 
 
 def test_the_version_is_told() -> None:
-    assert run_ctreg("--version").stdout == "ctreg 0.1.0\n"
+    assert run_ctreg("--version").stdout == f"ctreg {ctreg_cli.__version__}\n"
 
 
 @pytest.mark.parametrize("command", ["segment", "calibrate", "pose", "track"])
