@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ctreg_cli.errors import UnreadableSliceError
 
-#: no slice takes a decoder this long, not even on a busy machine
-TIMEOUT_S = 60.0
+#: a slice takes 5 to 50 ms; some decoders spin for half a minute over a damaged one
+TIMEOUT_S = 15.0
 _UNDECODABLE = "cannot be decoded: damaged, or of a kind unknown to the decoders"
 
 

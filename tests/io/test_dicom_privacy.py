@@ -1,0 +1,98 @@
+"""No text of a file gets out: not in slices, not in reasons, not in warnings, not in the list of series."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydicom.datadict import DicomDictionary, keyword_for_tag
+from pydicom.dataset import Dataset
+from pydicom.tag import Tag
+
+from ctreg_cli.errors import InputError
+from ctreg_cli.io.images import ImageSet, list_series, open_images
+from tests.io.dicom_samples import CANARY, ct_slice, dicom_bytes, item, write_dicom
+
+#: VRs that hold text a person may have typed, or that a writer may have put anything into
+TEXT_VRS = {"AE", "AS", "CS", "DA", "DS", "DT", "IS", "LO", "LT", "PN", "SH", "ST", "TM", "UC", "UI", "UR", "UT"}
+#: the text fields that are read at all
+READ = (
+    *("ImageType", "SOPClassUID", "SOPInstanceUID", "StudyInstanceUID", "SeriesInstanceUID", "FrameOfReferenceUID"),
+    *("Modality", "InstanceNumber", "NumberOfFrames", "AcquisitionDateTime", "AcquisitionDate", "AcquisitionTime"),
+    *("ContentDate", "ContentTime", "TriggerTime", "FrameTime", "FrameTimeVector", "GridFrameOffsetVector"),
+    *("PixelSpacing", "SliceThickness", "ImagePositionPatient", "ImageOrientationPatient", "PhotometricInterpretation"),
+    *("RescaleSlope", "RescaleIntercept", "LossyImageCompression"),
+)
+
+
+def everything_said(paths: list[Path]) -> str:
+    """All text that reading these paths brings forth."""
+    said = []
+    for read in (open_images, list_series):
+        try:
+            images: ImageSet = read(paths)
+        except InputError as error:
+            said.append(str(error))
+            continue
+        said += [*images.warnings, *images.skipped, *map(str, images.series)]
+        for one in images:
+            fields = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
+            said.append(str({name: value for name, value in fields.items() if name != "stored"}))
+    return "\n".join(said)
+
+
+def canary_bytes(ds: Dataset, keyword: str) -> bytes:
+    """The file with a canary in one field, whatever that field is for."""
+    raw = dicom_bytes(ds)
+    at = raw.index(Tag(keyword).group.to_bytes(2, "little") + Tag(keyword).element.to_bytes(2, "little"))
+    length = int.from_bytes(raw[at + 6 : at + 8], "little")
+    return raw[: at + 6] + (12).to_bytes(2, "little") + b"CANARYCANARY" + raw[at + 8 + length :]
+
+
+@pytest.mark.parametrize("keyword", READ)
+def test_a_canary_in_every_field_that_is_read(tmp_path: Path, keyword: str) -> None:
+    filler: dict[str, Any] = {"NumberOfFrames": 1, "TriggerTime": 1, "FrameTime": 1, "LossyImageCompression": "00"}
+    filler |= {"AcquisitionDateTime": "20240101", "FrameTimeVector": ["0"], "GridFrameOffsetVector": ["0"]}
+    ds = ct_slice(**({keyword: filler[keyword]} if keyword in filler else {}))
+    (tmp_path / "canary.dcm").write_bytes(canary_bytes(ds, keyword))
+    assert CANARY in (tmp_path / "canary.dcm").read_bytes().decode("latin1")
+    write_dicom(tmp_path / "good.dcm")
+    for paths in ([tmp_path], [tmp_path / "canary.dcm"], [tmp_path / "canary.dcm", tmp_path / "good.dcm"]):
+        assert CANARY not in everything_said(paths)
+
+
+def test_canaries_in_all_other_text_fields(tmp_path: Path) -> None:
+    ds = ct_slice()
+    for tag, (vr, *_) in DicomDictionary.items():
+        keyword = keyword_for_tag(tag)
+        group = tag >> 16
+        if vr in TEXT_VRS - {"DA", "DS", "DT", "IS", "TM", "UI"} and 0x0008 <= group < 0x7F00 and keyword not in READ:
+            if keyword == "SpecificCharacterSet":
+                continue
+            ds.add_new(tag, vr, CANARY if vr != "AS" else "042Y")
+    ds.RequestAttributesSequence = item(RequestedProcedureDescription=CANARY)
+    ds.PatientBirthDate = "19660606"
+    raw = dicom_bytes(ds)
+    assert raw.count(CANARY.encode()) > 500
+    (tmp_path / "a.dcm").write_bytes(raw)
+    (tmp_path / "b.dcm").write_bytes(raw[:-7])
+    said = everything_said([tmp_path])
+    assert CANARY not in said
+    assert "19660606" not in said
+    assert "a.dcm" in said
+
+
+def test_uids_are_in_their_one_place_only(tmp_path: Path) -> None:
+    images = open_images([write_dicom(tmp_path / "a.dcm")])
+    (slice_,) = images
+    assert slice_.info.uids["series_instance"] == "1.2.3.4.1"
+    assert set(slice_.info.uids) == {"sop_instance", "series_instance", "study_instance", "frame_of_reference"}
+    rest = str(dataclasses.replace(slice_.info, uids={})) + str(images.series) + str(images.warnings)
+    assert "1.2.3.4" not in rest
+
+
+def test_dates_do_not_get_into_times(tmp_path: Path) -> None:
+    (slice_,) = open_images([write_dicom(tmp_path / "a.dcm")])
+    assert slice_.info.time_s == 10 * 3600 + 15 * 60 + 0.25
