@@ -129,8 +129,8 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
     if chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P:
         return refused("bad_fit")
     near = [c for c in candidates[1:] if c.log_odds > best.log_odds - math.log(RIVAL_ODDS)]
-    rivals = [c for c in near if pose_distance_sd(best, c) > RIVAL_SD and _apart(best, c)]
-    doubts = [c for c in near if not _apart(best, c)]
+    doubts = [c for c in near if _knows_less(c, best)]
+    rivals = [c for c in near if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
     warnings: list[tuple[str, str]] = []
     widened, factor = widen_where_curved(model, scene, matches, best)
     if widened is None:
@@ -230,10 +230,15 @@ def assemble_candidate(
     )
 
 
-def _apart(a: Candidate, b: Candidate) -> bool:
-    """Whether two poses contradict each other, and not one of them merely knows less (a match fewer) than the other."""
-    twist = poses.difference(b.T_slice_model, a.T_slice_model)
-    return float(twist @ np.linalg.pinv(a.covariance + b.covariance, hermitian=True) @ twist) > RIVAL_SD**2
+def _knows_less(c: Candidate, best: Candidate) -> bool:
+    """Whether ``c`` is ``best`` with fewer matches, and does not contradict it: its own, wider covariance covers both."""
+    if not set(zip(c.rod_index.tolist(), c.spot_index.tolist(), strict=True)) < set(
+        zip(best.rod_index.tolist(), best.spot_index.tolist(), strict=True)
+    ):
+        return False
+    twist = poses.difference(c.T_slice_model, best.T_slice_model)
+    both = np.linalg.pinv(best.covariance + c.covariance, hermitian=True)
+    return float(twist @ both @ twist) <= RIVAL_SD**2
 
 
 def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
