@@ -195,6 +195,14 @@ def test_a_random_frame_has_no_symmetry_until_half_of_it_is_turned() -> None:
     np.testing.assert_array_equal(found.image, [4, 5, 6, 7, 0, 1, 2, 3])
 
 
+def test_a_symmetry_takes_each_rod_to_a_rod_of_its_own() -> None:
+    """Two wires side by side on one side, one on the other: half a turn brings both to the same one."""
+    ends = [((0, 30, -40), (0, 30, 40)), ((0, -30, -40), (0, -30, 40)), ((50, 0, -40), (50, 0, 40))]
+    assert len(symmetries(frame(*ends, ((-50, 0, -40), (-50, 0, 40))), within_mm=0.3)) > 0
+    pair = frame(*ends, ((-50, 0, -40), (-50, 0, 40)), ((-50.2, 0, -40), (-50.2, 0, 40)))
+    assert not any(symmetry.image[2] in (3, 4) for symmetry in symmetries(pair, within_mm=0.3))
+
+
 def test_a_mount_must_be_tight_enough_to_settle_a_symmetry() -> None:
     prism = uprights(6)
     sixth = next(s for s in symmetries(prism, within_mm=0.01) if round(s.angle_deg) == 60)
@@ -299,38 +307,42 @@ def test_prediction_grows_with_noise_and_pixels_and_tolerance() -> None:
     assert row.with_tolerance.rotation_deg > 3 * row.spot_noise.rotation_deg
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.2])
-def test_prediction_is_what_a_simulated_experiment_shows(tolerance: float) -> None:
+@pytest.mark.parametrize(("tolerance", "rods_seen"), [(0.0, 7), (0.2, 5)])
+def test_prediction_is_what_a_simulated_experiment_shows(tolerance: float, rods_seen: int) -> None:
     """One slice, many times: rods off their places, spots with noise, a weighted fit by SciPy, all written here.
 
-    400 trials know a standard deviation to 3 %.
+    200 trials know a standard deviation to 4 %.
     """
-    options = DesignOptions(noise_px=0.1, mm_per_px=0.5, samples=30, seed=5)
+    options = DesignOptions(noise_px=0.1, mm_per_px=0.5, samples=200, seed=5)
     shape = load_rod_model("z-frame-z001")
-    model = frame(*((tuple(r.start), tuple(r.end)) for r in shape.rods), tolerance=tolerance)
+    made = frame(*((tuple(r.start), tuple(r.end)) for r in shape.rods), tolerance=tolerance)
+    tip = np.array([40.0, -20.0, 35.0])
+    model = RodModel(name="made", rods=made.rods, targets=(Target(id="tip", point=frozen(tip, (3,))),))
     slices = sample_slices(model, options)
-    index = int(np.flatnonzero(slices.seen.all(axis=1))[0])
-    chosen = np.arange(options.samples) == index
-    rotation, tre = predict(model, slices, chosen, 1.0, options)
+    index = int(np.flatnonzero(slices.seen.sum(axis=1) == rods_seen)[0])
+    rotation, tre = predict(model, slices, np.arange(options.samples) == index, 1.0, options)
 
-    T = slices.T[index]
+    T, seen = slices.T[index], slices.seen[index]
     rng = np.random.default_rng(7)
-    starts, y = model.starts - model.centre, model.directions
+    starts, y = (model.starts - model.centre)[seen], model.directions[seen]
     d = y @ T[:3, :3].T
     k = d[:, :2] / d[:, 2:]
     C = 0.05**2 * np.eye(2) + tolerance**2 * (np.eye(2) + k[:, :, None] * k[:, None, :])
     whiten = np.linalg.inv(np.linalg.cholesky(C))
 
+    def rotated(parameters: np.ndarray) -> np.ndarray:
+        return Rotation.from_rotvec(parameters[3:]).as_matrix() @ T[:3, :3]
+
     def spots(parameters: np.ndarray, places: np.ndarray) -> np.ndarray:
-        R = Rotation.from_rotvec(parameters[3:]).as_matrix() @ T[:3, :3]
+        R = rotated(parameters)
         a, along = places @ R.T + T[:3, 3] + parameters[:3], y @ R.T
         return a[:, :2] - a[:, 2:] * along[:, :2] / along[:, 2:]
 
     errors = []
-    for _ in range(400):
-        shift = rng.normal(scale=tolerance, size=(len(model), 3)) if tolerance else np.zeros((len(model), 3))
+    for _ in range(200):
+        shift = rng.normal(scale=tolerance or 1e-12, size=(rods_seen, 3))
         across = shift - np.einsum("ij,ij->i", shift, y)[:, None] * y
-        measured = spots(np.zeros(6), starts + across) + rng.normal(scale=0.05, size=(len(model), 2))
+        measured = spots(np.zeros(6), starts + across) + rng.normal(scale=0.05, size=(rods_seen, 2))
         fit = least_squares(
             lambda p, m=measured: np.einsum("nij,nj->ni", whiten, spots(p, starts) - m).ravel(),
             np.zeros(6),
@@ -339,10 +351,10 @@ def test_prediction_is_what_a_simulated_experiment_shows(tolerance: float) -> No
         )
         errors.append(fit.x)
     experiment = np.array(errors)
-    rotation_seen = np.degrees(np.sqrt((experiment[:, 3:] ** 2).sum(axis=1).mean()))
-    tre_seen = np.sqrt((experiment[:, :3] ** 2).sum(axis=1).mean())
-    assert rotation[0] == pytest.approx(rotation_seen, rel=0.1)
-    assert tre[0, 0] == pytest.approx(tre_seen, rel=0.1)
+    tip_error = np.array([e[:3] + (rotated(e) - T[:3, :3]) @ (tip - model.centre) for e in experiment])
+    assert rotation[0] == pytest.approx(np.degrees(np.sqrt((experiment[:, 3:] ** 2).sum(axis=1).mean())), rel=0.12)
+    assert tre[0, 0] == pytest.approx(np.sqrt((experiment[:, :3] ** 2).sum(axis=1).mean()), rel=0.12)
+    assert tre[0, 1] == pytest.approx(np.sqrt((tip_error**2).sum(axis=1).mean()), rel=0.12)
 
 
 def test_the_cube_reaches_the_figures_of_the_method() -> None:
