@@ -114,7 +114,7 @@ OverlayFolder = Annotated[
     typer.Option("--overlay", metavar="DIR", help="Also draw what was found, one PNG a slice.", show_default=False),
 ]
 WithUids = Annotated[bool, typer.Option("--with-uids", help="Put the DICOM UIDs into JSON outputs.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Exit code 1 when any slice failed.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit code 1 when any slice is unreadable, or its pose not ok.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Explain every slice.")]
 UseMount = Annotated[

@@ -74,6 +74,10 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
     watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
 
     def on_result(result: FrameResult) -> None:
+        doubt = scale.doubt(result.info)
+        if doubt and not tally.n_doubtful:
+            talk.warn(doubt)
+        tally.n_doubtful += bool(doubt)
         tally.add(result)
         slice_ = watched.answered()
         if overlays and slice_:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import typer
 
 from ctreg_cli.cli.console import Talk, counted
-from ctreg_cli.imaging.slice import Slice
+from ctreg_cli.imaging.slice import Slice, SliceInfo
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.sinks import Sinks
 from ctreg_cli.io.sources import Source, open_sources
@@ -24,6 +24,8 @@ Result = TypeVar("Result")
 EXIT_NOTHING_FOUND = 1
 #: broken slices named one by one; the rest are counted
 MAX_NAMED = 10
+#: PixelSpacing is the same in every slice of a field of view; a scale typed in may correct it by a few percent
+NOMINAL_TOLERANCE, TYPED_TOLERANCE = 1e-3, 0.05
 
 
 def open_inputs(inputs: list[str], talk: Talk, *, series: int | None, spot_sd_px: float | None) -> Source:
@@ -46,6 +48,22 @@ class ScaleChoice:
 
     scale: Scale | None
     origin: str
+    #: the scale slices should state of themselves for this one to fit them, and by how much (relative) they may differ
+    stated: Scale | None = None
+    tolerance: float = 0.0
+
+    def doubt(self, info: SliceInfo) -> str:
+        """Why the scale does not look like this slice's; empty when it does, or nothing is known."""
+        own, stated = info.scale, self.stated
+        if own is None or stated is None:
+            return ""
+        away = max(abs(own.s_x / stated.s_x - 1), abs(own.s_y / stated.s_y - 1))
+        if away <= self.tolerance:
+            return ""
+        return (
+            f"{info.source} states {own.s_x:.6g} × {own.s_y:.6g} mm/px, but the {self.origin} used instead belongs to "
+            f"{stated.s_x:.6g} × {stated.s_y:.6g}: another field of view?"
+        )
 
 
 def choose_scale(
@@ -60,14 +78,15 @@ def choose_scale(
     if pair is not None:
         if calibration is not None:
             talk.warn(f"--scale overrides -c {calibration}")
-        return ScaleChoice(scale=Scale(s_x=pair[0], s_y=pair[1]), origin="option")
+        given = Scale(s_x=pair[0], s_y=pair[1])
+        return ScaleChoice(scale=given, origin="option", stated=given, tolerance=TYPED_TOLERANCE)
     if calibration is not None:
         from ctreg_cli.io.calibration_file import load_calibration
 
         found = load_calibration(calibration)
-        if found.model_sha256 != model.sha256:
+        if found.model_sha256 and found.model_sha256 != model.sha256:
             talk.warn(f"{calibration} was made with another frame file ({found.model_name}) than {model.name} here")
-        return ScaleChoice(scale=found.scale, origin="calibration")
+        return ScaleChoice(scale=found.scale, origin="calibration", stated=found.nominal, tolerance=NOMINAL_TOLERANCE)
     return ScaleChoice(scale=None, origin="dicom" if source.kind == "images" else "spots")
 
 

@@ -38,6 +38,8 @@ class PoseTally:
     total: int = 0
     n_ok: int = 0
     n_poses: int = 0
+    #: slices that state another scale than the one used would fit
+    n_doubtful: int = 0
 
     def add(self, result: FrameResult) -> None:
         self.total += 1
@@ -67,6 +69,8 @@ class PoseTally:
             rows.append(("scale", f"{scale.s_x:.6g} × {scale.s_y:.6g} mm/px, from {SCALE_SOURCES[self.scale_from]}"))
         elif self.scales:
             rows.append(("scale", f"{len(self.scales)} different ones, from {SCALE_SOURCES[self.scale_from]}"))
+        if self.n_doubtful:
+            rows.append(("", f"{self.n_doubtful} slices state a scale that does not go with it"))
         if self.warnings:
             rows.append(("warnings", counted(self.warnings)))
         return rows

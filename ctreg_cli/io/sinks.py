@@ -55,6 +55,8 @@ class Sink(Protocol[Item]):
 def plain(value: Any) -> Any:
     """The value as strict JSON has it: arrays as lists, a number that is not finite as null."""
     if isinstance(value, np.ndarray | np.generic):
+        if np.isfinite(value).all():
+            return value.tolist()
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -81,7 +83,10 @@ def cell(value: object) -> str:
 
 
 def _json(value: object) -> str:
-    return json.dumps(plain(value), allow_nan=False, ensure_ascii=False)
+    try:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False, default=plain)
+    except ValueError:  # a number is not finite; looking for it beforehand would cost more than all the rest
+        return json.dumps(plain(value), allow_nan=False, ensure_ascii=False)
 
 
 class CsvStream(Generic[Item]):

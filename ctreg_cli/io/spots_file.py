@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ctreg_cli._version import __version__
+from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import SpotsFileError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX, Spots
@@ -20,12 +21,17 @@ from ctreg_cli.io.sinks import Encoding
 
 SCHEMA = "ctreg/spots/1"
 
+#: columns of the spots table that say something of a spot, in order
+MEASURED = (
+    *("u_px", "v_px", "sd_u_px", "sd_v_px", "area_px", "contrast"),
+    # beyond the columns other programs may rely on
+    *("cov_uv_px2", "major_px", "minor_px", "angle_rad"),
+)
 #: columns of the spots table in order
 COLUMNS = (
-    *("slice", "source", "time_s", "s_x_mm", "s_y_mm", "spot", "u_px", "v_px", "sd_u_px", "sd_v_px"),
-    *("area_px", "contrast"),
-    # beyond the columns other programs may rely on
-    *("cov_uv_px2", "major_px", "minor_px", "angle_rad", "sd_assumed", "thickness_mm", "rows", "columns", "problem"),
+    *("slice", "source", "time_s", "s_x_mm", "s_y_mm", "spot"),
+    *MEASURED,
+    *("sd_assumed", "thickness_mm", "rows", "columns", "problem"),
 )
 
 
@@ -84,7 +90,7 @@ def spots_encoding(*, options: Mapping[str, object] | None = None, with_uids: bo
             "series": series_numbers.setdefault(info.series, len(series_numbers)),
             "problem": spot_slice.problem,
             "sd_assumed": spots.sd_assumed,
-            "spots": [_spot_record(spots, i) for i in range(len(spots))],
+            "spots": _spot_records(spots),
             "rejected": [{"u_px": r.u_px, "v_px": r.v_px, "reason": r.reason} for r in spots.rejected],
         } | uids
 
@@ -94,21 +100,22 @@ def spots_encoding(*, options: Mapping[str, object] | None = None, with_uids: bo
     return Encoding(columns=COLUMNS, rows=_rows, record=record, header=head, records_key="slices")
 
 
-def _spot_record(spots: Spots, i: int) -> dict[str, object]:
-    sd = spots.sd_px[i]
-    return {
-        "spot": i,
-        "u_px": spots.uv_px[i, 0],
-        "v_px": spots.uv_px[i, 1],
-        "sd_u_px": sd[0],
-        "sd_v_px": sd[1],
-        "covariance_px2": spots.covariance_px[i],
-        "area_px": spots.area_px[i],
-        "contrast": spots.contrast[i],
-        "major_px": spots.major_px[i],
-        "minor_px": spots.minor_px[i],
-        "angle_rad": spots.angle_rad[i],
-    }
+def _spot_records(spots: Spots) -> list[dict[str, object]]:
+    measured = _measured(spots).tolist()
+    return [
+        {"spot": i, **dict(zip(MEASURED, values, strict=True)), "covariance_px2": covariance}
+        for i, (values, covariance) in enumerate(zip(measured, spots.covariance_px.tolist(), strict=True))
+    ]
+
+
+def _measured(spots: Spots) -> FloatArray:
+    """(m, 10) what is known of each spot, in the order of ``MEASURED``."""
+    return np.column_stack(
+        [
+            *(spots.uv_px, spots.sd_px, spots.area_px, spots.contrast, spots.covariance_px[:, 0, 1]),
+            *(spots.major_px, spots.minor_px, spots.angle_rad),
+        ]
+    )
 
 
 def _rows(spot_slice: SpotSlice) -> list[Sequence[object]]:
@@ -121,10 +128,4 @@ def _rows(spot_slice: SpotSlice) -> list[Sequence[object]]:
         return [(*head, *after, spot_slice.problem)]
     rows, columns = info.shape or (None, None)
     tail = (int(spots.sd_assumed), info.thickness_mm, rows, columns, None)
-    measured = np.column_stack(
-        [
-            *(spots.uv_px, spots.sd_px, spots.area_px, spots.contrast, spots.covariance_px[:, 0, 1]),
-            *(spots.major_px, spots.minor_px, spots.angle_rad),
-        ]
-    ).tolist()
-    return [(*head, i, *values, *tail) for i, values in enumerate(measured)]
+    return [(*head, i, *values, *tail) for i, values in enumerate(_measured(spots).tolist())]

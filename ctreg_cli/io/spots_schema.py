@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -24,6 +25,7 @@ ROUNDING = 1e-9
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
 Sd = Annotated[float, Field(ge=MIN_SD_PX, le=MAX_COORDINATE_PX)]
 Positive = Annotated[float, Field(gt=0)]
+Matrix2 = tuple[tuple[float, float], tuple[float, float]]
 Row4 = tuple[float, float, float, float]
 
 
@@ -46,7 +48,7 @@ class SpotRecord(_Record):
     sd_v_px: Sd | None = None
     cov_uv_px2: float | None = None
     #: [[uu, uv], [uv, vv]]; where given it is used, and the three above only inform
-    covariance_px2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    covariance_px2: Matrix2 | None = None
     sd_assumed: bool = False
     area_px: float | None = None
     contrast: float | None = None
@@ -61,20 +63,20 @@ class SpotRecord(_Record):
         covariance = self.covariance()
         if covariance is None:
             return self
+        (uu, uv), (vu, vv) = covariance
         # a computed matrix may miss symmetry by its last bits
-        is_symmetric = abs(covariance[0, 1] - covariance[1, 0]) <= ROUNDING * np.trace(covariance)
-        if not is_symmetric or np.linalg.eigvalsh(covariance)[0] < MIN_SD_PX**2 / 2:
+        is_symmetric = abs(uv - vu) <= ROUNDING * (uu + vv)
+        least_variance = (uu + vv - math.hypot(uu - vv, 2 * uv)) / 2
+        if not is_symmetric or least_variance < MIN_SD_PX**2 / 2:
             raise _mistake("covariance: must be symmetric and positive definite")
         return self
 
-    def covariance(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
-        """(2, 2) px², or None where nothing is said."""
-        if self.covariance_px2 is not None:
-            return np.array(self.covariance_px2)
-        if self.sd_u_px is None or self.sd_v_px is None:
-            return None
+    def covariance(self) -> Matrix2 | None:
+        """Of the centre, px²; None where nothing is said."""
+        if self.covariance_px2 is not None or self.sd_u_px is None or self.sd_v_px is None:
+            return self.covariance_px2
         uv = self.cov_uv_px2 or 0.0
-        return np.array([[self.sd_u_px**2, uv], [uv, self.sd_v_px**2]])
+        return (self.sd_u_px**2, uv), (uv, self.sd_v_px**2)
 
 
 class RejectedRecord(_Record):
@@ -134,7 +136,7 @@ class SliceRecord(_Record):
         """The slice; a spot without standard deviation is given ``spot_sd_px``."""
         spots = self._ordered()
         known = [spot.covariance() for spot in spots]
-        assumed = np.eye(2) * spot_sd_px**2
+        assumed = ((spot_sd_px**2, 0.0), (0.0, spot_sd_px**2))
 
         def column(name: str) -> list[float]:
             return [np.nan if (value := getattr(spot, name)) is None else value for spot in spots]

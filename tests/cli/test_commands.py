@@ -13,9 +13,12 @@ import pytest
 import yaml
 from PIL import Image
 
+from ctreg_cli.cli.run import ScaleChoice
 from ctreg_cli.geometry.pose import rotation_angle
+from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.io.results import PoseRow, read_results
 from ctreg_cli.io.spots_file import read_spots
+from ctreg_cli.scale import Scale
 from tests.cli.conftest import FRAME, SAMPLES, run_ctreg
 
 #: 0.05 px spots on this cube bound a pose to about 0.2° and 0.05 mm; this is far outside, and far inside a wrong pose
@@ -134,6 +137,33 @@ def test_a_calibration_with_another_frame_is_warned_of(spots_csv: Path, tmp_path
     other.write_text(Path(FRAME).read_text(encoding="utf-8") + "\n# another file\n", encoding="utf-8")
     assert "another frame file" in run_ctreg("pose", spots_csv, "-m", other, "-c", calibration).stderr
     assert "another frame file" not in run_ctreg("pose", spots_csv, "-m", FRAME, "-c", calibration).stderr
+
+
+def test_a_scale_of_another_field_of_view_is_warned_of(spots_csv: Path, tmp_path: Path) -> None:
+    calibration = tmp_path / "c.yaml"
+    run_ctreg("calibrate", SAMPLES / "calib", "-m", FRAME, "-o", calibration, "-q")
+    assert "field of view" not in run_ctreg("pose", spots_csv, "-m", FRAME, "-c", calibration).stderr
+    text = calibration.read_text(encoding="utf-8")
+    calibration.write_text(text.replace("0.48828125", "0.5"), encoding="utf-8")
+    said = run_ctreg("pose", spots_csv, "-m", FRAME, "-c", calibration).stderr
+    assert said.count("another field of view") == 1
+
+
+@pytest.mark.parametrize(
+    ("own", "stated", "tolerance", "doubtful"),
+    [
+        ((0.5, 0.5), (0.5, 0.5), 0.0, False),
+        ((0.5, 0.5), (0.51, 0.5), 0.05, False),
+        ((0.5, 0.4), (0.4, 0.5), 0.05, True),
+    ],
+)
+def test_a_scale_is_doubted_when_slices_state_another(
+    own: tuple[float, float], stated: tuple[float, float], tolerance: float, doubtful: bool
+) -> None:
+    scale = Scale(s_x=stated[0], s_y=stated[1])
+    choice = ScaleChoice(scale=scale, origin="option", stated=scale, tolerance=tolerance)
+    assert bool(choice.doubt(SliceInfo(source="s", scale=Scale(s_x=own[0], s_y=own[1])))) is doubtful
+    assert not choice.doubt(SliceInfo(source="s"))
 
 
 def test_calibrate_writes_yaml_to_standard_output() -> None:
