@@ -1,7 +1,7 @@
 """Thousands of damaged files: no exception but our own, no hang, no flood of memory, and never a wrong geometry.
 
-The oracle for geometry is a parser of its own, for explicit VR little endian: whatever the reader says of a damaged file
-must be absent, or stand in the file for that parser too.
+The oracle for geometry is a parser of its own, for explicit VR little endian: whatever the reader says of a damaged
+file must be absent, or stand in the file for that parser too.
 """
 
 from __future__ import annotations

@@ -117,6 +117,32 @@ def test_one_bad_file_of_each_kind_does_not_end_the_run(tmp_path: Path) -> None:
     assert any("1 PNG file beside a DICOM series left out" in warning for warning in images.warnings)
 
 
+def test_a_file_cut_within_its_series_uid_is_not_of_another_series(tmp_path: Path) -> None:
+    write_series(tmp_path, 2)
+    good = (tmp_path / "s1.dcm").read_bytes()
+    at = good.index(b"\x20\x00\x0e\x00UI")
+    for cut in range(at, at + 16):
+        (tmp_path / "cut.dcm").write_bytes(good[:cut])
+        assert sources(open_images([tmp_path])) == ["s0.dcm", "s1.dcm", "cut.dcm"]
+
+
+def test_an_unreadable_slice_without_a_time_comes_last_of_its_series(tmp_path: Path) -> None:
+    write_series(tmp_path, 3)
+    broken = ct_slice(AcquisitionTime=None, ContentTime=None, InstanceNumber=None, PixelSpacing=[0, 0])
+    write_dicom(tmp_path / "a.dcm", broken)
+    images = open_images([tmp_path])
+    assert sources(images) == ["s0.dcm", "s1.dcm", "s2.dcm", "a.dcm"]
+    assert [item.info.time_s for item in images] == [36000, 36001, 36002, None]
+
+
+def test_a_series_without_a_readable_image_fits_least(tmp_path: Path) -> None:
+    write_series(tmp_path / "colour", 3, SeriesInstanceUID="1.2.6", PhotometricInterpretation="RGB")
+    write_series(tmp_path / "scout", 1, SeriesInstanceUID="1.2.7", ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"])
+    assert sources(open_images([tmp_path])) == ["scout/s0.dcm"]
+    write_series(tmp_path / "slices", 1)
+    assert sources(open_images([tmp_path])) == ["slices/s0.dcm"]
+
+
 def test_as_many_png_as_dicom_ask_for_a_choice(tmp_path: Path) -> None:
     write_series(tmp_path, 2)
     for k in range(2):
