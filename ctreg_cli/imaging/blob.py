@@ -11,6 +11,8 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
+#: width of the background that must be seen between a blob and the edge of its window, px
+BACKGROUND_PX = 4.0
 #: a window is moved to its blob's centre at most so often; once is nearly always enough
 RECENTRINGS = 3
 #: a pixel is 1/12 px² wide in second moments
@@ -63,8 +65,10 @@ class Blobs:
 
     @property
     def cut_off(self) -> BoolArray:
-        """(k,) whether the blob reaches the ring that should show its background: the window is too small."""
-        return np.asarray(self.own.reshape(len(self), -1)[:, ring(self.radius)].any(axis=1))
+        """(k,) whether the blob leaves too little background about it: the window is too small."""
+        u, v = grid(self.radius)
+        outer = np.hypot(u, v) > self.radius - BACKGROUND_PX
+        return np.asarray((self.own & outer).any(axis=(1, 2)))
 
     @property
     def at_border(self) -> BoolArray:

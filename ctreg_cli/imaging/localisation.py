@@ -18,22 +18,26 @@ from ctreg_cli.imaging.blob import Blobs
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, evaluate
 from ctreg_cli.imaging.window import dilated, disc, grid, nan_quantile, ring
 
-#: steps of the fit: later ones move a centre by less than a tenth of its sd
-ITERATIONS = 5
+#: steps of the fit at most; a centre that moves by less than this (px) is done, whatever the others do
+ITERATIONS, DONE_PX = 6, 2e-4
 #: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
 STRUCTURE_WEIGHT = 3.0
 #: correlation length of background structure, px: the width of streaks, which the same blur has made as the spots
-STRUCTURE_LENGTH_PX = 2.0
+STRUCTURE_LENGTH_PX = 1.5
 #: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
 NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
 #: this many pixels at the image's ceiling inside one blob mean that it was cut off there
 MIN_CLIPPED_PX = 3
+#: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
+MODEL_SD_PX = 0.005
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
 MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
 #: sd of a normal distribution over its median absolute deviation
 MAD_TO_SD = 1.4826
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
+#: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
+START_BLUR_PX2 = 0.1
 #: start and width (sd) of ln β: between a Gaussian and a flat top; and the sd of the logarithms of height and size
 START_LOG_BETA = 0.15
 SD_LOG_BETA = 0.5
@@ -83,10 +87,11 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     parameters, residuals, jacobian, normal = _levenberg_marquardt(start, u, v, values, clipped, weights)
 
     influence = np.linalg.inv(normal)[:, CENTRE] @ (jacobian * weights[:, None])  # (k, 2, p): d centre / d pixel
-    covariance = _seen_noise(influence, noise) + _seen_structure(
-        influence, residuals, blobs.radius, usable & (distance > NEAR_PX[0]) & (distance < NEAR_PX[1]), noise
-    )
     centre = parameters[:, CENTRE]
+    near = usable & (distance > NEAR_PX[0]) & (distance < NEAR_PX[1])
+    structure_variance = _odd_variance(residuals, near, centre, blobs.radius, noise)
+    covariance = _seen_noise(influence, noise) + _seen_structure(influence, structure_variance, blobs.radius)
+    covariance += MODEL_SD_PX**2 * np.eye(2)
     away = ((centre - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
     lost = ~(np.isfinite(centre).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (away <= size))
@@ -143,7 +148,10 @@ def _start(blobs: Blobs, n_clipped: IntArray) -> FloatArray:
     """
     flat = np.minimum(n_clipped / blobs.area, MAX_FLAT_SHARE)
     log2_over = np.maximum(flat / (1.0 - flat), MIN_LOG2_OVER)
-    metric = np.linalg.inv(4.0 * blobs.moments) * ((1.0 + log2_over) ** np.exp(-START_LOG_BETA))[:, None, None]
+    metric = (
+        np.linalg.inv(4.0 * (blobs.moments + START_BLUR_PX2 * np.eye(2)))
+        * ((1.0 + log2_over) ** np.exp(-START_LOG_BETA))[:, None, None]
+    )
     l_vv = np.sqrt(metric[:, 1, 1])
     l_uv = metric[:, 0, 1] / l_vv
     l_uu = np.sqrt(np.linalg.det(metric)) / l_vv
@@ -165,14 +173,14 @@ def _levenberg_marquardt(
     prior[SHAPE], prior[LOG_HEIGHT], prior[LOG_BETA] = 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_BETA**2
     low, high = start - 3 * SD_LOG_SHAPE, start + 3 * SD_LOG_SHAPE
     low[:, BACKGROUND : SHAPE.start], high[:, BACKGROUND : SHAPE.start] = -np.inf, np.inf
-    low[:, LOG_BETA], high[:, LOG_BETA] = 0.0, 1.5  # from a Gaussian to nearly a box
+    low[:, LOG_BETA], high[:, LOG_BETA] = -0.5, 1.5
     diagonal = np.arange(N_PARAMETERS)
 
     def cost_of(residuals: FloatArray, parameters: FloatArray) -> FloatArray:
         total: FloatArray = (weights * residuals**2).sum(axis=1) + (prior * (parameters - start) ** 2).sum(axis=1)
         return total
 
-    parameters, damping = start, np.full(k, 1e-3)
+    parameters, damping, done = start, np.full(k, 1e-3), np.zeros(k, dtype=bool)
     residuals, jacobian = evaluate(parameters, u, v, values, clipped)
     cost = cost_of(residuals, parameters)
     for _ in range(ITERATIONS):
@@ -185,15 +193,15 @@ def _levenberg_marquardt(
         trial = np.clip(parameters + step, low, high)
         trial_residuals, trial_jacobian = evaluate(trial, u, v, values, clipped)
         trial_cost = cost_of(trial_residuals, trial)
-        better = trial_cost <= cost
+        better = (trial_cost <= cost) & ~done
+        done |= better & (np.abs(step[:, CENTRE]).max(axis=1) < DONE_PX)
         damping *= np.where(better, 0.1, 10.0)
-        if better.all():
-            parameters, residuals, jacobian, cost = trial, trial_residuals, trial_jacobian, trial_cost
-            continue
         parameters = np.where(better[:, None], trial, parameters)
         residuals = np.where(better[:, None], trial_residuals, residuals)
         jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
         cost = np.where(better, trial_cost, cost)
+        if done.all():
+            break
     normal, _ = _normal_equations(jacobian, weights, residuals)
     normal[:, diagonal, diagonal] += prior + 1e-9
     return parameters, residuals, jacobian, normal
@@ -211,20 +219,34 @@ def _seen_noise(influence: FloatArray, noise: FloatArray) -> FloatArray:
     return np.asarray(influence @ influence.transpose(0, 2, 1) * noise[:, None, None] ** 2)
 
 
-def _seen_structure(
-    influence: FloatArray, residuals: FloatArray, radius: int, near: BoolArray, noise: FloatArray
+def _odd_variance(
+    residuals: FloatArray, near: BoolArray, centre: FloatArray, radius: int, noise: FloatArray
 ) -> FloatArray:
-    """Covariance (k, 2, 2) of the centre from the structure left about the blob, as a field correlated over a streak.
+    """Variance (k,) beyond noise of a field whose odd part about the centre is that of the residuals ``near`` the blob.
 
-    Args:
-        influence: (k, 2, p) derivative of the centre with respect to each pixel of the disc.
-        residuals: (k, p) what the fit leaves.
-        radius: of the window, px.
-        near: (k, p) where the structure is measured.
-        noise: (k,) sd of the pixel noise, which is no structure.
+    Only what noise alone would not show two times in three counts. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; what moves it is odd.
     """
-    mean_square = (residuals**2 * near).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
-    variance = np.maximum(mean_square - noise**2, 0.0)
+    n = 2 * radius + 1
+    k = len(residuals)
+    square, known = np.zeros((k, n * n)), np.zeros((k, n * n), dtype=bool)
+    square[:, disc(radius)], known[:, disc(radius)] = residuals, near
+    u, v = (axis.ravel()[disc(radius)] for axis in grid(radius))
+    twice = np.rint(2 * np.where(np.isfinite(centre), centre, 0.0))
+    mirror_u, mirror_v = twice[:, 0, None] - u, twice[:, 1, None] - v
+    inside = (np.abs(mirror_u) <= radius) & (np.abs(mirror_v) <= radius)
+    mirror = np.where(inside, (mirror_v + radius) * n + mirror_u + radius, 0).astype(np.intp)
+    paired = near & inside & np.take_along_axis(known, mirror, axis=1)
+    odd = np.where(paired, 0.5 * (residuals - np.take_along_axis(square, mirror, axis=1)), 0.0)
+    pairs = np.maximum(0.5 * paired.sum(axis=1), 1.0)
+    variance = (odd**2).sum(axis=1) / pairs
+    return np.asarray(np.maximum(variance - noise**2 * (1.0 + np.sqrt(2.0 / pairs)), 0.0))
+
+
+def _seen_structure(influence: FloatArray, variance: FloatArray, radius: int) -> FloatArray:
+    """Covariance (k, 2, 2) of the centre from a field of this ``variance`` (k,), correlated over the width of a streak.
+
+    ``influence`` (k, 2, p) is the derivative of the centre with respect to each pixel of the disc.
+    """
     n = 2 * radius + 1
     index = np.arange(n)
     correlation = np.exp(-0.5 * ((index[:, None] - index) / STRUCTURE_LENGTH_PX) ** 2)

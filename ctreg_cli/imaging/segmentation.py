@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.imaging.blob import Blobs, measure_blobs
+from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, measure_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
 from ctreg_cli.imaging.peaks import Peaks, image_noise, local_maxima, maxima_above, rate_peaks, smoothed
 from ctreg_cli.imaging.slice import Slice
@@ -38,21 +38,19 @@ class SegmentationOptions:
     #: at most so many spots a slice, the best ones
     max_spots: int = 40
     #: a spot stands at least so many noise sd above its surroundings
-    min_contrast_sd: float = 8.0
+    min_contrast_sd: float = 5.0
     #: and at least this share of the strongest spot's contrast: rods of one frame look alike
     min_relative_contrast: float = 0.1
     #: rods steeper than this against the slice normal are not looked for, degrees
     max_tilt_deg: float = 60.0
-    #: without a known rod diameter: a spot is at most this share of the image's longer side thick
-    max_width_of_image: float = 0.02
 
 
 DEFAULT_OPTIONS = SegmentationOptions()
 
 #: radii of the windows tried, px, until a spot fits with background about it
 WINDOW_RADII_PX = (7, 11, 17, 26)
-#: width of the strip between a spot and the edge of its window, px
-BACKGROUND_PX = 3.0
+#: without a known rod diameter a spot is at most so thick: in mm, or where there is no scale as a share of the image
+MAX_WIDTH_MM, MAX_WIDTH_OF_IMAGE, LEAST_MAX_WIDTH_PX = 6.0, 0.02, 8.0
 #: blur and clipping make a spot look wider than its rod: by this factor and this many pixels
 BLOOM_FACTOR, BLOOM_PX = 1.5, 4.0
 #: the slab blurs over more than its nominal thickness
@@ -160,10 +158,13 @@ class _Limits:
     def of(cls, slice_: Slice, options: SegmentationOptions) -> _Limits:
         scale, thickness = slice_.info.scale, slice_.info.thickness_mm
         px_per_mm = 1.0 / min(scale.s_x, scale.s_y) if scale is not None else None
-        if options.rod_diameter_mm is not None and px_per_mm is not None:
-            width = BLOOM_FACTOR * options.rod_diameter_mm[1] * px_per_mm + BLOOM_PX
+        if px_per_mm is None:
+            width = MAX_WIDTH_OF_IMAGE * max(slice_.stored.shape)
+        elif options.rod_diameter_mm is None:
+            width = MAX_WIDTH_MM * px_per_mm
         else:
-            width = max(options.max_width_of_image * max(slice_.stored.shape), BLOOM_PX)
+            width = BLOOM_FACTOR * options.rod_diameter_mm[1] * px_per_mm + BLOOM_PX
+        width = max(width, LEAST_MAX_WIDTH_PX)
         length = MAX_ELONGATION * width
         if thickness is not None and px_per_mm is not None:
             tilt = np.radians(options.max_tilt_deg)
