@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -45,10 +46,12 @@ class CtregGroup(TyperGroup):
 
 
 def _let_go_of_closed_output() -> None:
-    """When the reader of standard output has gone, keep Python from complaining about it on the way out."""
+    """Standard output takes no more (its reader has gone, the disk is full): keep Python from trying again at exit."""
+    if not isinstance(sys.stdout, io.TextIOWrapper):
+        return
     try:
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -95,4 +98,8 @@ app.command(short_help="Series in files and folders.")(info.info)
 
 def main() -> None:
     """Entry point of the ``ctreg`` command."""
+    for name in ("stdout", "stderr"):
+        # closed by the caller (``>&-``, a service): Python gives None, and what is said to nobody is no error
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))
     app()

@@ -88,9 +88,10 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
     results = estimate(watched, model, scale.scale, segmentation)
     try:
         consume(results, sinks, on_result, talk, total=len(source), what=command)
-    finally:
-        if tally.total:
-            talk.table(tally.rows())
+    except KeyboardInterrupt:
+        talk.table(tally.rows())
+        raise
+    talk.table(tally.rows())
     close(n_good=tally.n_poses, n_failed=tally.total - tally.n_ok, strict=arguments.strict)
 
 
