@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -47,8 +48,13 @@ def module_name(path: Path) -> str:
 SOURCES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
-def imports(path: Path) -> Iterator[tuple[str, int, bool]]:
+@cache
+def imports(path: Path) -> tuple[tuple[str, int, bool], ...]:
     """(module, line, whether it is loaded with the file) of every import, wherever in the file it stands."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, int, bool]]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     late: set[ast.AST] = set()
     for node in ast.walk(tree):
@@ -116,8 +122,8 @@ def test_the_rules_can_be_broken(tmp_path: Path) -> None:
     """The reader of imports sees those inside functions, and both ways of writing them."""
     file = tmp_path / "x.py"
     file.write_text("import yaml\ndef f():\n    from ctreg_cli.io import results\n    import pydicom.uid\n")
-    assert list(imports(file)) == [
+    assert imports(file) == (
         ("yaml", 1, True),
         ("ctreg_cli.io.results", 3, False),
         ("pydicom.uid", 4, False),
-    ]
+    )
