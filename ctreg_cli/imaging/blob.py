@@ -11,6 +11,8 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
+#: heights at which a blob is looked at for a valley through it, and how far it must stand above its surroundings' spread
+SPLIT_LEVELS, SPLIT_CONTRAST = (0.65, 0.85), 12.0
 #: width of the background that must be seen between a blob and the edge of its window, px
 BACKGROUND_PX = 4.0
 #: a window is moved to its blob's centre at most so often; once is nearly always enough
@@ -116,6 +118,9 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
     height = above.reshape(k, -1)[np.arange(k), peak]
     bright = above > 0.5 * height[:, None, None]
     own = _joined_to(bright, peak)
+    clear = np.flatnonzero(height > SPLIT_CONTRAST * _spread(values.reshape(k, -1)[:, ring(radius)], background))
+    if len(clear):
+        own[clear] = _apart_from_neighbour(above[clear], height[clear], own[clear], peak[clear])
     count = np.maximum(own.sum(axis=(1, 2)), 1)
     flat = own.reshape(k, -1).astype(np.float64)
     basis = np.stack([u, v, u * u, u * v, v * v]).reshape(5, -1)
@@ -135,6 +140,32 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         centre=np.stack([mean_u, mean_v], axis=1),
         moments=moments,
     )
+
+
+def _spread(ring_values: FloatArray, background: FloatArray) -> FloatArray:
+    """Half the range (k,) between the quartiles of the ring: about 0.7 sd of what is not flat there."""
+    return np.asarray(background - np.nan_to_num(nan_quantile(ring_values, 1.0 - BACKGROUND_QUANTILE))) / 2
+
+
+def _apart_from_neighbour(above: FloatArray, height: FloatArray, own: BoolArray, seed: IntArray) -> BoolArray:
+    """Blobs (k, n, n) without the part beyond a valley: there another spot begins, whose tail fills the valley up."""
+    for level in SPLIT_LEVELS:
+        high = own & (above > level * height[:, None, None])
+        mine = _joined_to(high, seed)
+        other = high & ~mine
+        split = np.flatnonzero(other.any(axis=(1, 2)))
+        if not len(split):
+            continue
+        mine, other, whole = mine[split], other[split], own[split]
+        while True:  # both parts grow in turn until they share the blob out
+            grown = dilated(mine) & whole & ~other
+            beyond = dilated(other) & whole & ~grown
+            if (grown == mine).all() and (beyond == other).all():
+                break
+            mine, other = grown, beyond
+        own = own.copy()
+        own[split] = mine
+    return own
 
 
 def _joined_to(bright: BoolArray, seed: IntArray) -> BoolArray:

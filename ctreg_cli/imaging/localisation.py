@@ -26,6 +26,8 @@ STRUCTURE_WEIGHT = 3.0
 STRUCTURE_LENGTH_PX = 1.5
 #: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
 NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
+#: another blob that begins within this of the edge touches the spot: it is left out of the fit, not of the covariance
+TOUCHING_PX = 2.0
 #: this many pixels at the image's ceiling inside one blob mean that it was cut off there
 MIN_CLIPPED_PX = 3
 #: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
@@ -76,7 +78,8 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     own = blobs.own.reshape(k, -1)[:, at]
     clipped &= ((clipped & own).sum(axis=1) >= MIN_CLIPPED_PX)[:, None]
     distance = _distance_beyond_edge(blobs, u, v)
-    usable = ~missing & ~dilated(blobs.foreign).reshape(k, -1)[:, at]
+    foreign = dilated(blobs.foreign).reshape(k, -1)[:, at]
+    usable = ~missing & ~foreign
     noise = _pixel_noise(blobs, usable & (distance > NOISE_BEYOND_PX))
     structure = _background_structure(blobs, noise)
     reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
@@ -89,6 +92,7 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     influence = np.linalg.inv(normal)[:, CENTRE] @ (jacobian * weights[:, None])  # (k, 2, p): d centre / d pixel
     centre = parameters[:, CENTRE]
     near = usable & (distance > NEAR_PX[0]) & (distance < NEAR_PX[1])
+    near |= foreign & ~missing & (distance < TOUCHING_PX)
     structure_variance = _odd_variance(residuals, near, centre, blobs.radius, noise)
     covariance = _seen_noise(influence, noise) + _seen_structure(influence, structure_variance, blobs.radius)
     covariance += MODEL_SD_PX**2 * np.eye(2)
