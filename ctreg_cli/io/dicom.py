@@ -274,7 +274,7 @@ def _macros(group: Elements) -> dict[str, Elements]:
 def _notes(header: Header, layout: Layout) -> tuple[str, ...]:
     notes = list(header.notes)
     if is_lossy(header):
-        notes.append("lossy compression: spots may have moved")
+        notes.append("compressed with loss: spots may have moved")
     if layout.inverted:
         notes.append("MONOCHROME1, read with small stored values as bright")
     if excess_bytes(header, layout):

@@ -45,7 +45,7 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
 def decode(codestream: bytes, transfer_syntax: str, options: dict[str, Any]) -> bytes:
     """The stored values of one frame, row by row."""
     from pydicom.encaps import encapsulate
-    from pydicom.pixels import get_decoder
+    from pydicom.pixels.decoders.base import get_decoder
 
     stored, _ = get_decoder(transfer_syntax).as_array(
         encapsulate([codestream], has_bot=False), index=0, raw=True, **options

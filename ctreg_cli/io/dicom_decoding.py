@@ -29,7 +29,7 @@ _UNDECODABLE = "cannot be decoded: damaged, or of a kind unknown to the decoders
 @lru_cache(maxsize=32)
 def codec_available(transfer_syntax: str) -> bool:
     """Whether a decoder for this compression is installed."""
-    from pydicom.pixels import get_decoder
+    from pydicom.pixels.decoders.base import get_decoder
 
     return bool(get_decoder(transfer_syntax).is_available)
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydicom.encaps import get_frame
 from pydicom.uid import (
+    JPEG2000,
     UID,
     DeflatedExplicitVRLittleEndian,
     ExplicitVRBigEndian,
@@ -25,6 +26,7 @@ from pydicom.uid import (
     JPEG2000TransferSyntaxes,
     JPEGBaseline8Bit,
     JPEGExtended12Bit,
+    JPEGLSNearLossless,
     JPEGLSTransferSyntaxes,
     JPEGTransferSyntaxes,
     RLELossless,
@@ -61,7 +63,8 @@ _CODEC_NAMES: dict[str, str] = {
     **dict.fromkeys([uid for uid in JPEG2000TransferSyntaxes if "2000" in uid.name], "JPEG 2000"),
     RLELossless: "RLE",
 }
-_ALWAYS_LOSSY = (JPEGBaseline8Bit, JPEGExtended12Bit, "1.2.840.10008.1.2.4.81")
+_ALWAYS_LOSSY = (JPEGBaseline8Bit, JPEGExtended12Bit)
+_MAYBE_LOSSY = (JPEGLSNearLossless, JPEG2000)
 _GREY = {"MONOCHROME1", "MONOCHROME2"}
 
 
@@ -196,8 +199,9 @@ def pixel_element(header: Header) -> PixelElement:
 
 
 def is_lossy(header: Header) -> bool:
-    """Whether the image went through lossy compression at some time, as far as the file says."""
-    return header.elements.text("LossyImageCompression") == "01" or header.transfer_syntax in _ALWAYS_LOSSY
+    """Whether the image may have gone through lossy compression at some time."""
+    said, syntax = header.elements.text("LossyImageCompression"), header.transfer_syntax
+    return said == "01" or syntax in _ALWAYS_LOSSY or (syntax in _MAYBE_LOSSY and said != "00")
 
 
 def excess_bytes(header: Header, layout: Layout) -> int:

@@ -29,7 +29,7 @@ import numpy as np
 
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import InputError, UnreadableSliceError
-from ctreg_cli.imaging.slice import Slice, UnreadableSlice
+from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.io.image_record import ImageRecord, Kind, SeriesKey
 from ctreg_cli.io.png import is_png, read_png
 
@@ -50,6 +50,7 @@ NO_PIXELS = "DICOM without an image"
 OTHER_SERIES = "image of another series"
 PNG_BESIDE_DICOM = "PNG beside DICOM"
 NOT_A_FILE = "not a regular file"
+CLOSED_FOLDER = "folder that cannot be opened"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -236,7 +237,7 @@ def _find(paths: Sequence[Path]) -> _Found:
     lost: list[ImageRecord] = []
     skipped: Counter[str] = Counter()
     for number, path in enumerate(paths):
-        for file, source in _files(path):
+        for file, source in _files(path, skipped):
             records = _read_file(file, source)
             if isinstance(records, str):
                 skipped[records] += 1
@@ -265,14 +266,20 @@ def natural_key(name: str) -> NaturalKey:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part.casefold()) for part in parts if part)
 
 
-def _files(path: Path) -> Iterator[tuple[Path, str]]:
+def _files(path: Path, skipped: Counter[str]) -> Iterator[tuple[Path, str]]:
     """The file, or the files of the folder in natural order, each with its source name."""
+
+    def cannot_open(error: OSError) -> None:
+        if error.filename == str(path):
+            raise InputError(f"{_shown(path)}: the folder cannot be opened ({error.strerror})")
+        skipped[CLOSED_FOLDER] += 1
+
     if not path.exists():
         raise InputError(f"{_shown(path)}: no such file or folder")
     if not path.is_dir():
         yield path, _printable(path.name)
         return
-    files = [Path(folder) / name for folder, _, names in os.walk(path) for name in names]
+    files = [Path(folder) / name for folder, _, names in os.walk(path, onerror=cannot_open) for name in names]
     named = sorted((natural_key(relative), relative, file) for file in files for relative in [_relative(file, path)])
     for _, relative, file in named:
         yield file, relative
@@ -287,8 +294,10 @@ def _read_file(path: Path, source: str) -> list[ImageRecord] | str:
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
-    except OSError:
-        head = b""
+    except OSError as error:
+        info = SliceInfo(source=source)
+        unknown = SeriesKey(None, Kind.SLICE, "")
+        return [ImageRecord(info=info, series=unknown, problem=f"the file cannot be read ({error.strerror})")]
     if is_png(path, head):
         return [read_png(path, source)]
     if not is_dicom(path, head):

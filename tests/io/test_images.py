@@ -328,6 +328,35 @@ def test_pipes_and_links_do_not_hang(tmp_path: Path) -> None:
     assert images.skipped == {"not a regular file": 2}
 
 
+def test_files_and_folders_that_may_not_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for a user without permission; root, who may run the tests, is refused nothing."""
+    write_series(tmp_path, 2)
+    write_dicom(tmp_path / "mine")
+    (tmp_path / "closed").mkdir()
+    opened, listed = Path.open, os.scandir
+
+    def refuse_file(path: Path, *args: Any, **options: Any) -> Any:
+        if path.name == "mine":
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *args, **options)
+
+    def refuse_folder(path: str) -> Any:
+        if Path(path) in refused:
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    refused = {tmp_path / "closed"}
+    monkeypatch.setattr(Path, "open", refuse_file)
+    monkeypatch.setattr(os, "scandir", refuse_folder)
+    images = open_images([tmp_path])
+    assert sources(images) == ["s0.dcm", "s1.dcm", "mine"]
+    assert "Permission denied" in images.warnings[-1]
+    assert images.skipped == {"folder that cannot be opened": 1}
+    refused.add(tmp_path)
+    with pytest.raises(InputError, match="the folder cannot be opened \\(Permission denied\\)"):
+        open_images([tmp_path])
+
+
 def test_names_of_any_bytes_can_be_written(tmp_path: Path) -> None:
     write_dicom(tmp_path / os.fsdecode(b"caf\xe9\n.dcm"))
     (source,) = sources(open_images([tmp_path]))
