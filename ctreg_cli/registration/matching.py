@@ -44,11 +44,13 @@ _GATE2 = 20.0
 #: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
 _WIDEST_GATE = 0.2
 #: hypotheses a stage hands on to refinement
-_KEEP_PER_TRIPLE = 48
-#: stop searching when a match beats chance by this much (ln): a rival among unrelated spots is then out of the question
-_OVERWHELMING = math.log(1e9)
+_KEEP_PER_TRIPLE = 24
+#: votes are a rough measure of the odds: hypotheses this many nats under the best of a rod triple are not refined
+_VOTES_WITHIN = 25.0
 #: rivals within this many nats of the best are kept for the verdict (a good deal more than the verdict's own 100 : 1)
 _KEEP_WITHIN = 12.0
+#: matches within this many nats of the best are taken apart
+_DOUBT_WITHIN = 7.0
 #: spot triples examined at once, to bound memory
 _CHUNK = 40_000
 
@@ -95,19 +97,11 @@ class Matches:
 
     def subset(self, rows: IntArray | BoolArray) -> Matches:
         """These hypotheses only, in this order."""
-        fit = Linearisation(
-            residual_px=self.fit.residual_px[rows],
-            weight=self.fit.weight[rows],
-            jacobian=self.fit.jacobian[rows],
-            chi2=self.fit.chi2[rows],
-            lambda_mm=self.fit.lambda_mm[rows],
-            predicted_px=self.fit.predicted_px[rows],
-        )
         return Matches(
             T=self.T[rows],
             spot_of_rod=self.spot_of_rod[rows],
             log_odds=self.log_odds[rows],
-            fit=fit,
+            fit=self.fit.subset(rows),
             expected=self.expected[rows],
         )
 
@@ -115,10 +109,7 @@ class Matches:
 def join(parts: list[Matches]) -> Matches:
     """Stacks joined into one, best first."""
     fit = Linearisation(
-        **{
-            name: np.concatenate([getattr(p.fit, name) for p in parts])
-            for name in ("residual_px", "weight", "jacobian", "chi2", "lambda_mm", "predicted_px")
-        }
+        **{name: np.concatenate([getattr(p.fit, name) for p in parts]) for name in Linearisation.__dataclass_fields__}
     )
     joined = Matches(
         T=np.concatenate([p.T for p in parts]),
@@ -230,36 +221,46 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
         return None
     layout = plan(model)
     found: list[Matches] = []
-    best = -np.inf
+    seen: set[bytes] = set()
+    best: Matches | None = None
     done = 0
     for k in range(min(len(model), m), least_matches - 1, -1):
-        for triple in range(done, layout.prefix[k]):
-            part = _search_triple(model, scene, layout.triples[triple], least_matches)
+        if best is not None and not _could_rival(scene, best, k):
+            break
+        while done < layout.prefix[k]:
+            part = _search_triple(model, scene, layout.triples[done], least_matches, seen)
+            done += 1
             if part is not None:
                 found.append(part)
-                best = max(best, float(part.log_odds.max()))
-            if best > _OVERWHELMING:
-                break
-        done = max(done, layout.prefix[k])
-        if best > _OVERWHELMING or best > _greatest_log_odds(model, scene, k - 1) + _KEEP_WITHIN:
-            break
+                if best is None or part.log_odds[0] > best.log_odds[0]:
+                    best = part.subset(np.array([0]))
     if not found:
         return None
-    pool = distinct(model, join(found))
-    return pool
+    return distinct(model, join(found))
 
 
-def _greatest_log_odds(model: RodModel, scene: Scene, k: int) -> float:
-    """More than any match of ``k`` spots can reach: nothing missed, no residual, spots as few as they are."""
-    variance = np.sqrt(np.linalg.det(scene.covariance_mm)).min() + float(model.tolerances.min()) ** 2
-    reach = math.pi * (1.5 * model.size_mm) ** 2
-    per_spot = math.log(P_SEEN) - math.log(2 * math.pi * variance) + math.log(reach)
-    # six of the 2k dimensions are spent on the pose: about three spots' worth
-    return (k - 3) * per_spot
+def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
+    """Whether a match of only ``k`` spots can come near the odds of the best one found.
+
+    Against the best it lacks the worth of n − k matches, and owes for as many missed rods; it may gain all of the best's
+    residual, and some volume of poses for knowing them less well.
+    """
+    matched = best.spot_of_rod[0] >= 0
+    n, m = int(matched.sum()), len(scene.xy_mm)
+    if k >= n:
+        return True
+    weight = best.fit.weight[0, matched]
+    precision = np.sort(weight[:, 0, 0] * weight[:, 1, 1] - weight[:, 0, 1] * weight[:, 1, 0])[: n - k]
+    spread = np.ptp(scene.xy_mm[best.spot_of_rod[0, matched]], axis=0)
+    worth = math.log(P_SEEN / (1 - P_SEEN)) - math.log(2 * math.pi) + 0.5 * np.log(precision)
+    worth += math.log(max(float(spread[0] * spread[1]), 1e-9)) - math.log(max(m - k, 1))
+    return float(worth.sum() - 0.5 * best.fit.chi2[0]) < _KEEP_WITHIN
 
 
-def _search_triple(model: RodModel, scene: Scene, rods: IntArray, least_matches: int) -> Matches | None:
-    """Poses from one rod triple against all spot triples, voted, refined and weighed."""
+def _search_triple(
+    model: RodModel, scene: Scene, rods: IntArray, least_matches: int, seen: set[bytes]
+) -> Matches | None:
+    """Poses from one rod triple against all spot triples, voted, refined and weighed; ``seen``: match sets already weighed."""
     layout = plan(model)
     noise = _noise_mm(model, scene)
     kept: list[tuple[FloatArray, FloatArray, IntArray]] = []
@@ -277,9 +278,16 @@ def _search_triple(model: RodModel, scene: Scene, rods: IntArray, least_matches:
     if not kept:
         return None
     score, T, spot_of_rod = (np.concatenate(column) for column in zip(*kept, strict=True))
-    if len(score) == 0:
+    top: list[int] = []
+    for i in np.argsort(-score, kind="stable"):
+        if len(top) >= _KEEP_PER_TRIPLE or score[i] < score[top[0] if top else i] - _VOTES_WITHIN:
+            break
+        key = spot_of_rod[i].tobytes()
+        if key not in seen:
+            seen.add(key)
+            top.append(int(i))
+    if not top:
         return None
-    top = np.argsort(-score, kind="stable")[:_KEEP_PER_TRIPLE]
     return verify(model, scene, T[top], spot_of_rod[top], least_matches)
 
 
@@ -375,12 +383,10 @@ def visibility(
     return may, must
 
 
-def verify(
-    model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int, rounds: int = 2
-) -> Matches | None:
+def verify(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int) -> Matches | None:
     """Refine hypotheses on their spots, let all spots vote again with the smaller covariance, refine, weigh."""
-    for _ in range(rounds):
-        T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=5, step_tolerance=1e-4)
+    for _ in range(2):
+        T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=4, step_tolerance=1e-3)
         spot_of_rod = assign(model, scene, T, fit)
         enough = ((spot_of_rod >= 0).sum(axis=1) >= least_matches) & np.isfinite(fit.chi2)
         T, spot_of_rod = T[enough], spot_of_rod[enough]
@@ -399,7 +405,7 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
     """Refine hypotheses with the matches they have, and give each its odds."""
     if len(T) == 0:
         return None
-    T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=15, step_tolerance=1e-7)
+    T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=10, step_tolerance=1e-5)
     projection = project(T, model.starts, model.directions)
     may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     matched = spot_of_rod >= 0
@@ -511,12 +517,17 @@ def _same(model: RodModel, T_a: FloatArray, T_b: FloatArray) -> bool:
 # --- doubt ----------------------------------------------------------------------------------------------------------
 
 
-def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int = 4, most: int = 6) -> Matches:
+def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int = 4, most: int = 4) -> Matches:
     """Look for what else explains the spots: other minima of the same matches, and matches that differ in one spot."""
     pool = [matches]
-    for row in range(min(most, len(matches))):
-        if matches.log_odds[row] < matches.log_odds[0] - _KEEP_WITHIN:
+    taken: set[bytes] = set()
+    for row in range(len(matches)):
+        key = matches.spot_of_rod[row].tobytes()
+        if key in taken:
+            continue
+        if len(taken) >= most or matches.log_odds[row] < matches.log_odds[0] - _DOUBT_WITHIN:
             break
+        taken.add(key)
         for part in (
             _restart(model, scene, matches, row, least_matches),
             _vary(model, scene, matches, row, least_matches),

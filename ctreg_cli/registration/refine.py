@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field, scale_jacobian
 from ctreg_cli.geometry.projection import project
@@ -35,7 +35,7 @@ class Observations:
     #: (2,) or (b, 2) ``[s_x, s_y]``
     mm_per_px: FloatArray
 
-    def subset(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.intp]] | BoolArray) -> Observations:
+    def subset(self, rows: IntArray | BoolArray) -> Observations:
         """The hypotheses ``rows`` only."""
         scale = self.mm_per_px if self.mm_per_px.ndim == 1 else self.mm_per_px[rows]
         return Observations(
@@ -59,6 +59,19 @@ class Linearisation:
     lambda_mm: FloatArray
     #: (b, n, 2) predicted spots, px
     predicted_px: FloatArray
+
+    def subset(self, rows: IntArray | BoolArray) -> Linearisation:
+        """The hypotheses ``rows`` only."""
+        return Linearisation(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
+
+    def replaced(self, rows: IntArray, others: Linearisation) -> Linearisation:
+        """These rows taken from ``others``."""
+        if len(rows) == len(self.chi2):
+            return others
+        fields = {name: np.array(getattr(self, name)) for name in self.__dataclass_fields__}
+        for name, values in fields.items():
+            values[rows] = getattr(others, name)
+        return Linearisation(**fields)
 
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
         """Information ``Jᵀ W J`` (b, 6, 6) and gradient ``Jᵀ W r`` (b, 6)."""
@@ -128,42 +141,32 @@ def refine(
         Poses (b, 4, 4), the linearisation there, and the number of steps taken.
     """
     unit = np.array([1, 1, 1, *(3 * [1 / model.size_mm])])  # mm and rad brought to one size
+    T = np.array(T)
     here = linearise(model, T, observations)
     damping = np.full(len(T), 1e-4)
-    step_count = 0
-    for step_count in range(1, iterations + 1):
-        H, g = here.normal_equations()
+    active = np.arange(len(T))
+    steps = 0
+    while steps < iterations and len(active):
+        steps += 1
+        part = here if len(active) == len(T) else here.subset(active)
+        seen = observations if len(active) == len(T) else observations.subset(active)
+        H, g = part.normal_equations()
         H = H * (unit[:, None] * unit)
-        g = g * unit
-        diagonal = np.einsum("bii->bi", H)
-        H = H.copy()
+        diagonal = np.array(np.einsum("bii->bi", H))
         floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
-        np.einsum("bii->bi", H)[...] += damping[:, None] * diagonal + floor
-        step = np.linalg.solve(H, g[..., None])[..., 0] * unit
-        turn = np.linalg.norm(step[:, 3:], axis=1)
+        np.einsum("bii->bi", H)[...] += damping[active, None] * diagonal + floor
+        step = np.linalg.solve(H, (g * unit)[..., None])[..., 0] * unit
+        turn = np.sqrt((step[:, 3:] ** 2).sum(axis=1))
         step *= np.minimum(1, _MAX_TURN_RAD / np.maximum(turn, 1e-300))[:, None]
-        T_new = poses.update(T, step)
-        there = linearise(model, T_new, observations)
-        better = there.chi2 <= here.chi2
-        damping = np.where(better, damping * 0.1, np.minimum(damping * 10, 1e8))
+        T_new = poses.update(T[active], step)
+        there = linearise(model, T_new, seen)
+        better = there.chi2 <= part.chi2
+        damping[active] = np.where(better, damping[active] * 0.1, np.minimum(damping[active] * 10, 1e8))
         size = np.abs(step / unit).max(axis=1) / model.size_mm
-        T = np.where(better[:, None, None], T_new, T)
-        here = _choose(better, there, here)
-        if bool((size <= step_tolerance).all()):
-            break
-    return T, here, step_count
-
-
-def _choose(better: BoolArray, there: Linearisation, here: Linearisation) -> Linearisation:
-    if better.all():
-        return there
-    pick = {
-        name: np.where(
-            better.reshape(-1, *([1] * (getattr(here, name).ndim - 1))), getattr(there, name), getattr(here, name)
-        )
-        for name in ("residual_px", "weight", "jacobian", "chi2", "lambda_mm", "predicted_px")
-    }
-    return Linearisation(**pick)
+        T[active[better]] = T_new[better]
+        here = here.replaced(active[better], there.subset(better))
+        active = active[size > step_tolerance]
+    return T, here, steps
 
 
 def covariance_from_information(H: FloatArray, size_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -178,7 +181,7 @@ def covariance_from_information(H: FloatArray, size_mm: float) -> tuple[FloatArr
     singular = values <= 1e-12 * largest
     variance = np.where(singular, 1e6, 1 / np.maximum(values, 1e-300))
     scaled = (vectors * variance[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    condition = np.sqrt(largest[..., 0] / np.maximum(values[..., 0], 1e-300))
+    condition = np.sqrt(largest[..., 0] / np.maximum(values[..., 0], 1e-30 * largest[..., 0]))
     return scaled * (unit[:, None] * unit), np.where(singular.any(axis=-1), np.inf, condition)
 
 

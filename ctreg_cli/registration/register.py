@@ -116,7 +116,8 @@ def register(
 
 def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches) -> Registration:
     """The verdict on a slice's matches, best first."""
-    candidates = [candidate(model, scene, spots, scale, matches, row) for row in range(len(matches))]
+    near_rows = np.nonzero(matches.log_odds > matches.log_odds[0] - math.log(RIVAL_ODDS))[0]
+    candidates = refined_candidates(model, scene, spots, scale, matches.subset(near_rows))
     best = candidates[0]
 
     def refused(reason: str) -> Registration:
@@ -128,9 +129,8 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
         return refused("no_consistent_match")
     if chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P:
         return refused("bad_fit")
-    near = [c for c in candidates[1:] if c.log_odds > best.log_odds - math.log(RIVAL_ODDS)]
-    doubts = [c for c in near if _knows_less(c, best)]
-    rivals = [c for c in near if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
+    doubts = [c for c in candidates[1:] if _knows_less(c, best)]
+    rivals = [c for c in candidates[1:] if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
     warnings: list[tuple[str, str]] = []
     widened, factor = widen_where_curved(model, scene, matches, best)
     if widened is None:
@@ -182,15 +182,28 @@ def _distinct_poses(candidates: list[Candidate]) -> list[Candidate]:
     return kept
 
 
-def candidate(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches, row: int) -> Candidate:
-    """A match refined to the last digit, with its covariance, in the contract's units."""
-    spot_of_rod = matches.spot_of_rod[row : row + 1]
-    T, fit, steps = refine(model, matches.T[row : row + 1], observations(scene, spot_of_rod), iterations=30)
-    H, _ = fit.normal_equations()
-    C, _ = covariance_from_information(H[0], model.size_mm)
-    return assemble_candidate(
-        model, spots, scale, T[0], fit, spot_of_rod[0], matches.expected[row], C, float(matches.log_odds[row]), steps
+def refined_candidates(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches) -> list[Candidate]:
+    """Matches refined to the last digit, with their covariances, in the contract's units."""
+    T, fit, steps = refine(
+        model, matches.T, observations(scene, matches.spot_of_rod), iterations=30, step_tolerance=1e-8
     )
+    H, _ = fit.normal_equations()
+    C, _ = covariance_from_information(H, model.size_mm)
+    return [
+        assemble_candidate(
+            model,
+            spots,
+            scale,
+            T[row],
+            fit.subset(np.array([row])),
+            matches.spot_of_rod[row],
+            matches.expected[row],
+            C[row],
+            float(matches.log_odds[row]),
+            steps,
+        )
+        for row in range(len(matches))
+    ]
 
 
 def assemble_candidate(
