@@ -28,16 +28,8 @@ from ctreg_cli.io.dicom_header import (
     read_header,
     tag_name,
 )
-from ctreg_cli.io.dicom_pixels import (
-    Layout,
-    excess_bytes,
-    is_lossy,
-    locate,
-    pixel_element,
-    read_layout,
-    read_padding,
-    read_rescale,
-)
+from ctreg_cli.io.dicom_layout import Layout, read_layout, read_padding, read_rescale
+from ctreg_cli.io.dicom_pixels import excess_bytes, is_lossy, locate, pixel_element
 from ctreg_cli.io.dicom_time import delayed, frame_delays_s, read_clock
 from ctreg_cli.io.image_record import ImageRecord, Kind, Pixels, SeriesKey
 

@@ -86,7 +86,7 @@ class Elements:
     def __contains__(self, keyword: str) -> bool:
         return _TAG[keyword] in self.raw
 
-    def bytes(self, keyword: str) -> bytes | None:
+    def value(self, keyword: str) -> bytes | None:
         """The stored value without padding; None where absent or empty."""
         element = self.raw.get(_TAG[keyword])
         if element is None or not element.value:
@@ -98,7 +98,7 @@ class Elements:
 
     def text(self, keyword: str) -> str:
         """An ASCII code string; empty where absent. For comparing with known codes, never for showing."""
-        value = self.bytes(keyword)
+        value = self.value(keyword)
         return value.decode("ascii", "replace").strip(" \0") if value else ""
 
     def codes(self, keyword: str) -> tuple[str, ...]:
@@ -117,7 +117,7 @@ class Elements:
         Raises:
             HeaderProblem: text that is no decimal number (a decimal comma, say), not finite, or another count.
         """
-        value = self.bytes(keyword)
+        value = self.value(keyword)
         if value is None:
             return None
         vr = self.raw[_TAG[keyword]].VR
@@ -151,7 +151,7 @@ class Elements:
         Raises:
             HeaderProblem: not one integer.
         """
-        value = self.bytes(keyword)
+        value = self.value(keyword)
         if value is None:
             return None
         vr = self.raw[_TAG[keyword]].VR
