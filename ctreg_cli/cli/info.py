@@ -12,7 +12,7 @@ from ctreg_cli.cli.console import Talk
 from ctreg_cli.cli.options import Quiet, SeriesNumber
 
 if TYPE_CHECKING:
-    from ctreg_cli.io.images import SeriesInfo
+    from ctreg_cli.io.image_series import SeriesInfo
 
 #: of the table where standard output is no terminal: nothing is cut off
 _PIPED_WIDTH = 240

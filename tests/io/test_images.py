@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from ctreg_cli.cli.info import info
 from ctreg_cli.errors import InputError, UnreadableSliceError
 from ctreg_cli.imaging.slice import Slice, UnreadableSlice
-from ctreg_cli.io.images import ImageSet, list_series, natural_key, open_images, read_slices
+from ctreg_cli.io.image_files import natural_key
+from ctreg_cli.io.images import ImageSet, list_series, open_images, read_slices
 from tests.io.dicom_samples import ct_slice, dicom_bytes, pixels, write_dicom
 
 
@@ -305,6 +306,13 @@ def test_all_unreadable(tmp_path: Path) -> None:
     with pytest.raises(UnreadableSliceError, match=r"none of the 3 images can be read; the first, 0\.dcm: Pixel Data"):
         open_images([tmp_path])
     assert list_series([tmp_path]).series[0].n_unreadable == 3
+
+
+def test_all_unreadable_in_several_series(tmp_path: Path) -> None:
+    for k in range(3):
+        write_dicom(tmp_path / f"{k}.dcm", ct_slice(SeriesInstanceUID=f"1.2.{k}", PhotometricInterpretation="RGB"))
+    with pytest.raises(UnreadableSliceError, match=r"none of the 3 images can be read; the first, 0\.dcm: Photometric"):
+        open_images([tmp_path])
 
 
 def test_read_slices_wants_them_all(tmp_path: Path) -> None:
