@@ -11,7 +11,7 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
-#: heights at which a blob is looked at for a valley through it, and how far it must stand above its surroundings' spread
+#: heights at which a blob is searched for a valley through it; it must stand above so many times its ring's spread
 SPLIT_LEVELS, SPLIT_CONTRAST = (0.65, 0.85), 12.0
 #: width of the background that must be seen between a blob and the edge of its window, px
 BACKGROUND_PX = 4.0

@@ -228,7 +228,8 @@ def _odd_variance(
 ) -> FloatArray:
     """Variance (k,) beyond noise of a field whose odd part about the centre is that of the residuals ``near`` the blob.
 
-    Only what noise alone would not show two times in three counts. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; what moves it is odd.
+    Only what exceeds noise by its own standard error counts. A wrong shape of the profile leaves residuals that are
+    even about the centre and do not move it; only odd ones do.
     """
     n = 2 * radius + 1
     k = len(residuals)
