@@ -65,5 +65,5 @@ def shown(path: Path) -> str:
 
 def named(paths: Sequence[Path]) -> str:
     """The user's paths in a message, the first few of them."""
-    shown = [shown(path) for path in paths[:3]]
-    return ", ".join(shown) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+    return ", ".join(shown(path) for path in paths[:3]) + more
