@@ -23,13 +23,15 @@ ITERATIONS, DONE_PX = 6, 2e-4
 #: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
 STRUCTURE_WEIGHT = 3.0
 #: correlation length of background structure, px: the width of streaks, which the same blur has made as the spots
-STRUCTURE_LENGTH_PX = 1.5
+STRUCTURE_LENGTH_PX = 2.0
 #: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
 NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
 #: another blob that begins within this of the edge touches the spot: it is left out of the fit, not of the covariance
 TOUCHING_PX = 2.0
 #: this many pixels at the image's ceiling inside one blob mean that it was cut off there
 MIN_CLIPPED_PX = 3
+#: parameters that are odd about the centre (centre, gradient), and the least share of odd structure they can leave
+ODD, LEAST_KEPT = [0, 1, 4, 5], 0.2
 #: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
 MODEL_SD_PX = 0.005
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
@@ -89,12 +91,13 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     start = _start(blobs, (clipped & own).sum(axis=1))
     parameters, residuals, jacobian, normal = _levenberg_marquardt(start, u, v, values, clipped, weights)
 
-    influence = np.linalg.inv(normal)[:, CENTRE] @ (jacobian * weights[:, None])  # (k, 2, p): d centre / d pixel
+    influence = np.linalg.inv(normal)[:, ODD] @ (jacobian * weights[:, None])  # (k, 4, p): d parameter / d pixel
     centre = parameters[:, CENTRE]
     near = usable & (distance > NEAR_PX[0]) & (distance < NEAR_PX[1])
     near |= foreign & ~missing & (distance < TOUCHING_PX)
-    structure_variance = _odd_variance(residuals, near, centre, blobs.radius, noise)
-    covariance = _seen_noise(influence, noise) + _seen_structure(influence, structure_variance, blobs.radius)
+    odd_variance = _odd_variance(residuals, near, centre, blobs.radius, noise)
+    seen, kept = _through_fit(influence, jacobian[:, ODD], near, blobs.radius)
+    covariance = _seen_noise(influence[:, CENTRE], noise) + (odd_variance / kept)[:, None, None] * seen
     covariance += MODEL_SD_PX**2 * np.eye(2)
     away = ((centre - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
@@ -247,15 +250,34 @@ def _odd_variance(
     return np.asarray(np.maximum(variance - noise**2 * (1.0 + np.sqrt(2.0 / pairs)), 0.0))
 
 
-def _seen_structure(influence: FloatArray, variance: FloatArray, radius: int) -> FloatArray:
-    """Covariance (k, 2, 2) of the centre from a field of this ``variance`` (k,), correlated over the width of a streak.
+def _through_fit(
+    influence: FloatArray, jacobian: FloatArray, near: BoolArray, radius: int
+) -> tuple[FloatArray, FloatArray]:
+    """What the fit makes of structure of unit variance, correlated over the width of a streak.
 
-    ``influence`` (k, 2, p) is the derivative of the centre with respect to each pixel of the disc.
+    Args:
+        influence, jacobian: (k, 4, p), derivatives of the odd parameters with respect to the pixels, and the reverse.
+        near: (k, p) where the residuals are looked at.
+        radius: of the window, px.
+
+    Returns:
+        Covariance (k, 2, 2) of the centre, and the share (k,) of the odd variance that the fit leaves in the residuals:
+        it follows structure as if it were the spot.
     """
-    n = 2 * radius + 1
-    index = np.arange(n)
-    correlation = np.exp(-0.5 * ((index[:, None] - index) / STRUCTURE_LENGTH_PX) ** 2)
-    square = np.zeros((len(influence), 2, n * n))
-    square[:, :, disc(radius)] = influence
-    field = (correlation @ square.reshape(-1, 2, n, n) @ correlation).reshape(square.shape)
-    return np.asarray(square @ field.transpose(0, 2, 1) * variance[:, None, None])
+    n, at = 2 * radius + 1, disc(radius)
+    square = np.zeros((*influence.shape[:2], n * n))
+    square[:, :, at] = influence
+    blur = _correlation(radius)
+    field = (blur @ square.reshape(*square.shape[:2], n, n) @ blur).reshape(square.shape)[:, :, at]
+    covariance = influence @ field.transpose(0, 2, 1)
+    taken = 2.0 * (jacobian * field).sum(axis=1) - (jacobian * (covariance @ jacobian)).sum(axis=1)
+    share = 2.0 * (taken * near).sum(axis=1) / np.maximum(near.sum(axis=1), 1)  # half of the variance is odd
+    return covariance[:, CENTRE, CENTRE], np.maximum(1.0 - share, LEAST_KEPT)
+
+
+@cache
+def _correlation(radius: int) -> FloatArray:
+    """(n, n): correlation of structure along one axis of a window."""
+    index = np.arange(2 * radius + 1)
+    step = (index[:, None] - index) / STRUCTURE_LENGTH_PX
+    return frozen(np.exp(-0.5 * step**2), step.shape)

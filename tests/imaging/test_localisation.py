@@ -1,0 +1,126 @@
+"""Centres at the Cramér–Rao bound, covariances that are true, and wider where something disturbs the spot."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from ctreg_cli.imaging.segmentation import find_spots
+from ctreg_cli.imaging.spots import Spots
+from tests.imaging.rendering import as_slice, cramer_rao, render_grid, render_rod
+
+SIDE, PITCH = 7, 34
+
+#: rod and scanner; noise sd; value at which the scanner clips
+CASES = {
+    "thin rod": ({"contrast": 3000.0}, 100.0, np.inf),
+    "faint rod": ({"contrast": 1500.0, "blur_mm": 0.45}, 60.0, np.inf),
+    "thick rod": ({"diameter_mm": 2.0, "mm_per_px": 0.33, "blur_mm": 0.35, "contrast": 2500.0}, 100.0, np.inf),
+    "clipped": ({"contrast": 11000.0, "slope": (0.3, 0.1)}, 150.0, 3071.0),
+    "30° in 5 mm": ({"thickness_mm": 5.0, "slope": (0.5, 0.3), "contrast": 9000.0}, 100.0, np.inf),
+    "small pixels, dark floor": ({"contrast": 400.0}, 15.0, np.inf),
+}
+
+
+@cache
+def rendered(case: str) -> tuple[np.ndarray, np.ndarray]:
+    return render_grid(np.random.default_rng(len(case)), SIDE, PITCH, **CASES[case][0])
+
+
+def scanned(image: np.ndarray, noise: float, ceiling: float, rng: np.random.Generator, rod: dict[str, object]) -> Spots:
+    values = np.minimum(image + 40.0 + rng.normal(0.0, noise, image.shape), ceiling)
+    slice_ = as_slice(values, mm_per_px=rod.get("mm_per_px", 0.5), thickness_mm=rod.get("thickness_mm", 2.0))  # type: ignore[arg-type]
+    return find_spots(slice_)
+
+
+def errors(spots: Spots, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (k, 2) and covariances (k, 2, 2) of the spots within 2 px of a true centre, each centre's nearest."""
+    distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2)
+    nearest = distance.argmin(axis=0)
+    seen = distance.min(axis=0) < 2.0
+    return (spots.uv_px[nearest] - uv)[seen], spots.covariance_px[nearest][seen]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_centres_reach_the_cramer_rao_bound_and_covariances_are_true(case: str) -> None:
+    rod, noise, ceiling = CASES[case]
+    image, uv = rendered(case)
+    rng = np.random.default_rng(1)
+    parts = [errors(scanned(image, noise, ceiling, rng, rod), uv) for _ in range(4)]
+    error, covariance = (np.concatenate(p) for p in zip(*parts, strict=True))
+    assert len(error) == 4 * 40  # max_spots of SIDE² = 49
+    bound = np.sqrt(np.trace(cramer_rao(noise, ceiling, **rod)))
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 1.15 * bound
+    chi2 = np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error).mean() / 2
+    assert 0.7 < chi2 < 1.25
+
+
+@pytest.mark.parametrize(
+    ("case", "most_px"), [("thin rod", 0.01), ("thick rod", 0.01), ("30° in 5 mm", 0.01), ("clipped", 0.03)]
+)
+def test_where_in_its_pixel_a_rod_lies_does_not_move_the_centre(case: str, most_px: float) -> None:
+    rod, _, ceiling = CASES[case]
+    image, uv = rendered(case)
+    error, _ = errors(scanned(image, 0.3, ceiling, np.random.default_rng(2), rod), uv)
+    assert np.abs(error).max() < most_px
+
+
+def test_a_sharp_clipped_spot_is_off_by_less_than_its_sd_says() -> None:
+    rod = {"mm_per_px": 0.625, "diameter_mm": 2.0, "thickness_mm": 0.6, "slope": (1.0, 0.0), "blur_mm": 0.35}
+    image, uv = render_grid(np.random.default_rng(3), SIDE, PITCH, contrast=8000.0, **rod)
+    error, covariance = errors(scanned(image, 10.0, 3071.0, np.random.default_rng(4), rod), uv)
+    assert np.abs(error).max() < 0.03
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert np.sqrt(((error / sd) ** 2).mean()) < 1.6
+
+
+@pytest.mark.parametrize("ceiling", [np.inf, 3071.0])
+def test_a_neighbour_four_pixels_away_is_another_spot_and_widens_both(ceiling: float) -> None:
+    rng = np.random.default_rng(5)
+    for angle in rng.uniform(0, np.pi, 8):
+        first = np.array([35.0, 35.0]) + rng.uniform(-0.5, 0.5, 2)
+        second = first + 4.2 * np.array([np.cos(angle), np.sin(angle)])
+        alone = render_rod((71, 71), tuple(first), contrast=9000.0)
+        both = alone + render_rod((71, 71), tuple(second), contrast=9000.0)
+        noise = rng.normal(0.0, 20.0, both.shape)
+        pair = find_spots(as_slice(np.minimum(both + noise, ceiling)))
+        error, covariance = errors(pair, np.stack([first, second]))
+        assert len(error) == 2
+        assert np.abs(error).max() < 0.15
+        assert np.sqrt(((error**2) / np.diagonal(covariance, axis1=1, axis2=2)).max()) < 3.0
+        single = find_spots(as_slice(np.minimum(alone + noise, ceiling)))
+        assert (np.trace(covariance, axis1=1, axis2=2) > 4 * np.trace(single.covariance_px[0])).all()
+
+
+def test_a_streak_through_a_spot_widens_it() -> None:
+    rng = np.random.default_rng(6)
+    row, column = np.mgrid[:71, :71]
+    scaled, widened = [], []
+    for _ in range(30):
+        uv = np.array([35.0, 35.0]) + rng.uniform(-0.5, 0.5, 2)
+        angle, offset = rng.uniform(0, np.pi), rng.uniform(-3, 3)
+        across = (column - uv[0]) * np.sin(angle) - (row - uv[1]) * np.cos(angle) - offset
+        clean = render_rod((71, 71), tuple(uv), contrast=9000.0) + rng.normal(0.0, 20.0, (71, 71))
+        streak = find_spots(as_slice(np.minimum(clean + 400 * np.exp(-0.5 * (across / 1.5) ** 2), 3071)))
+        alone = find_spots(as_slice(np.minimum(clean, 3071)))
+        error, covariance = errors(streak, uv[None])
+        widened.append(np.trace(covariance[0]) / np.trace(alone.covariance_px[0]))
+        scaled.append(error[0] / np.sqrt(np.diag(covariance[0])))
+    assert np.median(widened) > 4.0  # a streak through the very middle moves nothing
+    assert np.sqrt(np.mean(np.square(scaled))) < 2.0
+
+
+def test_correlated_noise_is_not_taken_for_white() -> None:
+    """A smooth kernel correlates neighbours' noise; the centre then scatters more than the Laplacian alone says."""
+    image, uv = rendered("thin rod")
+    rng = np.random.default_rng(7)
+    scaled = []
+    for _ in range(3):
+        noise = gaussian_filter(rng.normal(0.0, 1.0, image.shape), 1.2)
+        spots = find_spots(as_slice(image + 60.0 * noise / noise.std()))
+        error, covariance = errors(spots, uv)
+        scaled.append(error / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
+    assert 0.7 < np.sqrt((np.concatenate(scaled) ** 2).mean()) < 1.4

@@ -1,0 +1,217 @@
+"""Every rod is found, whatever the scanner's numbers look like; what is no rod is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+
+from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, find_spots, measure_spots
+from ctreg_cli.imaging.slice import Slice, SliceInfo
+from ctreg_cli.scale import Scale
+from tests.imaging.rendering import as_slice, render_rod
+
+SAMPLES = Path(__file__).parents[2] / "sample_data"
+SHAPE = (128, 160)
+UV = np.array([[30.3, 40.2], [80.7, 60.1], [120.2, 100.9]])
+
+
+@pytest.fixture(scope="module")
+def image() -> np.ndarray:
+    rods = sum(render_rod(SHAPE, (u, v)) for u, v in UV)
+    return np.clip(rods + 50.0 + np.random.default_rng(0).normal(0.0, 15.0, SHAPE), -1024, 3071)
+
+
+def centres(slice_: Slice, options: SegmentationOptions = DEFAULT_OPTIONS) -> np.ndarray:
+    """Centres found, in reading order of u."""
+    uv = find_spots(slice_, options).uv_px
+    return uv[np.argsort(uv[:, 0])]
+
+
+# -------------------------------------------------------------------------------------------- simulated CT with truth
+
+
+def cube_slices() -> Iterator[tuple[Slice, np.ndarray]]:
+    for truth_file in sorted(SAMPLES.glob("*/truth.json")):
+        for truth in json.loads(truth_file.read_text()):
+            dataset = pydicom.dcmread(truth_file.parent / truth["file"])
+            row_mm, column_mm = (float(x) for x in dataset.PixelSpacing)
+            info = SliceInfo(
+                source=truth["file"],
+                scale=Scale.from_pixel_spacing(row_mm, column_mm),
+                thickness_mm=float(dataset.SliceThickness),
+            )
+            slice_ = Slice(
+                info=info,
+                stored=dataset.pixel_array,
+                slope=float(dataset.RescaleSlope),
+                intercept=float(dataset.RescaleIntercept),
+            )
+            yield slice_, np.array([[s["u_px"], s["v_px"]] for s in truth["spots"]])
+
+
+def test_every_rod_of_the_simulated_ct_is_found_at_a_twentieth_of_a_pixel_with_a_true_sd() -> None:
+    error, scaled = [], []
+    for slice_, uv in cube_slices():
+        spots = find_spots(slice_)
+        assert len(spots) <= 12
+        nearest = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).argmin(axis=0)
+        assert sorted(nearest) == list(range(len(uv)))  # the rods come first, whatever else there is
+        difference = spots.uv_px[nearest] - uv
+        error.append(difference)
+        scaled.append(difference / spots.sd_px[nearest])
+        tracked = measure_spots(slice_, uv + 1.0, 5.0)
+        again = np.linalg.norm(tracked.uv_px[:, None] - uv, axis=2).argmin(axis=0)
+        np.testing.assert_allclose(tracked.uv_px[again], spots.uv_px[nearest], atol=1e-3)
+    assert len(error) == 20
+    assert (np.sqrt((np.concatenate(error) ** 2).mean(axis=0)) < 0.05).all()
+    assert np.abs(np.concatenate(error)).max() < 0.2
+    assert 0.7 < np.sqrt((np.concatenate(scaled) ** 2).mean()) < 1.2
+
+
+# ----------------------------------------------------------------------------------------------- whatever the numbers
+
+
+def test_the_same_picture_in_other_numbers_gives_the_same_centres(image: np.ndarray) -> None:
+    stored = np.rint(image).astype(np.int16)
+    expected = centres(as_slice(image))
+    np.testing.assert_allclose(expected, UV, atol=0.05)
+    others = [
+        as_slice(image + 1024, dtype=np.uint16, intercept=-1024.0),
+        as_slice(stored, dtype=np.int32),
+        as_slice(stored, dtype=np.float64),
+        as_slice(2 * stored.astype(int), dtype=np.int32, slope=0.5),
+        as_slice(-stored.astype(int), slope=-1.0),
+        Slice(info=as_slice(image).info, stored=stored.astype(">i2")),
+        Slice(info=as_slice(image).info, stored=np.asfortranarray(stored)),
+    ]
+    for other in others:
+        np.testing.assert_allclose(centres(other), expected, atol=1e-6)
+    np.testing.assert_allclose(centres(as_slice(image / 16 + 30, dtype=np.uint8)), expected, atol=0.03)
+
+
+def test_contrast_is_in_the_units_of_the_image(image: np.ndarray) -> None:
+    hounsfield = find_spots(as_slice(image + 1024, intercept=-1024.0)).contrast
+    doubled = find_spots(as_slice(image + 1024, slope=2.0)).contrast
+    np.testing.assert_allclose(doubled, 2 * hounsfield)
+
+
+def test_dark_spots_are_found_when_asked_for_and_by_auto(image: np.ndarray) -> None:
+    expected = centres(as_slice(image))
+    inverted = as_slice(1000 - np.rint(image))
+    np.testing.assert_allclose(centres(inverted, SegmentationOptions(polarity="dark")), expected, atol=1e-6)
+    np.testing.assert_allclose(centres(inverted, SegmentationOptions(polarity="auto")), expected, atol=1e-6)
+    np.testing.assert_allclose(centres(as_slice(image), SegmentationOptions(polarity="auto")), expected, atol=1e-6)
+    assert len(measure_spots(inverted, UV, 4.0, SegmentationOptions(polarity="auto"))) == 3
+    assert not len(find_spots(inverted))
+
+
+def test_shifting_the_picture_shifts_and_turning_it_turns_the_centres(image: np.ndarray) -> None:
+    expected = centres(as_slice(image))
+    shifted = np.pad(image, ((5, 0), (7, 0)), mode="reflect")
+    np.testing.assert_allclose(centres(as_slice(shifted)), expected + np.array([7, 5]), atol=1e-6)
+    turned = find_spots(as_slice(image.T)).uv_px
+    np.testing.assert_allclose(turned[np.argsort(turned[:, 1])], expected[:, ::-1], atol=2e-3)
+
+
+def test_without_scale_and_thickness_the_rods_are_found_too(image: np.ndarray) -> None:
+    np.testing.assert_allclose(centres(as_slice(image, mm_per_px=None, thickness_mm=None)), UV, atol=0.05)
+
+
+@pytest.mark.parametrize("padding", [-3024, 3571])
+def test_padding_is_neither_metal_nor_an_edge(image: np.ndarray, padding: int) -> None:
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    outside = np.hypot(row - 64, column - 80) > 62
+    padded = np.where(outside, padding, np.rint(image))
+    spots = find_spots(as_slice(padded, padding=(padding, padding)))
+    np.testing.assert_allclose(np.sort(spots.uv_px, axis=0), np.sort(centres(as_slice(image)), axis=0), atol=1e-3)
+
+
+def test_a_long_tilted_spot_in_a_thick_slab_is_one_spot() -> None:
+    rod = {"thickness_mm": 8.0, "slope": (0.9, 0.3), "contrast": 15000.0}
+    values = np.minimum(render_rod((96, 96), (48.3, 47.6), **rod), 3071) + np.random.default_rng(1).normal(
+        0, 20, (96, 96)
+    )
+    spots = find_spots(as_slice(values, thickness_mm=8.0))
+    assert len(spots) == 1
+    np.testing.assert_allclose(spots.uv_px[0], [48.3, 47.6], atol=0.05)
+    assert spots.major_px[0] > 3 * spots.minor_px[0]
+    assert np.tan(spots.angle_rad[0]) == pytest.approx(1 / 3, abs=0.05)
+
+
+def test_a_faint_rod_beside_bright_ones_stays(image: np.ndarray) -> None:
+    faint = image + render_rod(SHAPE, (60.0, 20.0), contrast=1200.0)
+    assert np.linalg.norm(find_spots(as_slice(faint)).uv_px - [60.0, 20.0], axis=1).min() < 0.2
+
+
+# ----------------------------------------------------------------------------------------------------- what is no rod
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (lambda row, column: 2000.0 * (np.hypot(row - 64, column - 80) < 10), "too_large"),
+        (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 60)), "too_large"),
+        (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 19)), "too_elongated"),
+        (lambda row, column: 2000.0 * (np.hypot(row - 64, column - 1.5) < 2.5), "at_border"),
+    ],
+)
+def test_what_is_no_rod_is_left_out_with_the_reason(values: object, reason: str) -> None:
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    noise = np.random.default_rng(2).normal(0.0, 15.0, SHAPE)
+    spots = find_spots(as_slice(values(row, column) + noise, thickness_mm=0.5))  # type: ignore[operator]
+    assert not len(spots)
+    assert reason in {r.reason for r in spots.rejected}
+
+
+def test_the_best_spots_are_kept_when_there_are_too_many(image: np.ndarray) -> None:
+    weak = image + render_rod(SHAPE, (60.0, 20.0), contrast=1500.0)
+    spots = find_spots(as_slice(weak), SegmentationOptions(max_spots=3))
+    np.testing.assert_allclose(spots.uv_px[np.argsort(spots.uv_px[:, 0])], UV, atol=0.05)
+    assert [r.reason for r in spots.rejected] == ["too_many"]
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.uint8, np.float64])
+def test_noise_alone_has_no_spots(dtype: type) -> None:
+    noise = np.random.default_rng(3).normal(100.0, 20.0, (256, 256))
+    assert not len(find_spots(as_slice(noise, dtype=dtype)))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (1, 60), (5, 5), (17, 33)])
+def test_a_picture_too_small_or_empty_has_no_spots_and_no_error(shape: tuple[int, int]) -> None:
+    assert not len(find_spots(as_slice(np.zeros(shape))))
+    assert not len(find_spots(as_slice(np.full(shape, -2000), padding=(-2000, -2000))))
+    assert not len(find_spots(as_slice(np.full(shape, np.nan), dtype=np.float64)))
+    assert not len(measure_spots(as_slice(np.zeros(shape)), np.zeros((1, 2)), 3.0))
+
+
+# ------------------------------------------------------------------------------------------------------ tracking path
+
+
+def test_measuring_about_predictions_gives_what_searching_the_slice_gives(image: np.ndarray) -> None:
+    slice_ = as_slice(image)
+    found = find_spots(slice_)
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        measured = measure_spots(slice_, found.uv_px + rng.uniform(-3, 3, (3, 2)), np.array([5.0, 6.0, 7.0]))
+        nearest = np.linalg.norm(measured.uv_px[:, None] - found.uv_px, axis=2).argmin(axis=0)
+        np.testing.assert_allclose(measured.uv_px[nearest], found.uv_px, atol=1e-3)
+        np.testing.assert_allclose(measured.covariance_px[nearest], found.covariance_px, rtol=0.05)
+
+
+def test_a_spot_near_two_predictions_is_measured_once_and_nothing_where_nothing_is(image: np.ndarray) -> None:
+    slice_ = as_slice(image)
+    assert len(measure_spots(slice_, np.array([[30.0, 40.0], [32.0, 41.0]]), 5.0)) == 1
+    nowhere = np.array([[60.0, 20.0], [-40.0, 900.0], [np.nan, 3.0], [159.0, 127.0]])
+    assert not len(measure_spots(slice_, nowhere, 5.0))
+    assert not len(measure_spots(slice_, np.empty((0, 2)), np.empty(0)))
+
+
+def test_only_spots_within_the_radius_are_returned(image: np.ndarray) -> None:
+    slice_ = as_slice(image)
+    assert len(measure_spots(slice_, UV[:1] + np.array([4.0, 0.0]), 5.0)) == 1
+    assert not len(measure_spots(slice_, UV[:1] + np.array([4.0, 0.0]), 3.0))
