@@ -157,7 +157,7 @@ def test_a_faint_rod_beside_bright_ones_stays(image: np.ndarray) -> None:
         (lambda row, column: 2000.0 * (np.hypot(row - 64, column - 80) < 10), "too_large"),
         (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 60)), "too_large"),
         (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 19)), "too_elongated"),
-        (lambda row, column: 2000.0 * (np.hypot(row - 64, column - 1.5) < 2.5), "at_border"),
+        (lambda row, column: render_rod(SHAPE, (1.3, 64.0)), "at_border"),
     ],
 )
 def test_what_is_no_rod_is_left_out_with_the_reason(values: object, reason: str) -> None:
