@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import CalibrationError
@@ -162,7 +162,7 @@ def _believable(fit: ScaleFit) -> bool:
     return bool(
         np.isfinite(fit.chi2)
         and fit.degrees_of_freedom > 0
-        and chi2_distribution.sf(fit.chi2, fit.degrees_of_freedom) > BAD_FIT_P**2
+        and chdtrc(fit.degrees_of_freedom, fit.chi2) > BAD_FIT_P**2
         and (fit.mm_per_px > 0.9 * low).all()
         and (fit.mm_per_px < 1.1 * high).all()
         and (sd < 0.2 * fit.mm_per_px).all()
@@ -265,7 +265,7 @@ def _report(
     slices: Sequence[SpotSlice], model: RodModel, nominal: Scale | None, labelled: list[_Labelled], fit: ScaleFit
 ) -> CalibrationRun:
     inflation = 1.0
-    if chi2_distribution.sf(fit.chi2, fit.degrees_of_freedom) < INFLATE_P:
+    if chdtrc(fit.degrees_of_freedom, fit.chi2) < INFLATE_P:
         inflation = math.sqrt(fit.chi2 / fit.degrees_of_freedom)
     sd = np.sqrt(np.diag(fit.covariance)) * inflation
     matched = np.stack([x.spot_of_rod >= 0 for x in labelled])

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
@@ -24,8 +24,11 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
-#: a match is believed when its odds against chance exceed this (ln); false alarms: see benchmarks/accuracy.py
-ACCEPT_LOG_ODDS = math.log(1e4)
+#: a match is believed when its odds against chance exceed this (ln): chance is a rival like any other, and then some;
+#: false alarms measured by benchmarks/accuracy.py
+ACCEPT_LOG_ODDS = math.log(300)
+#: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
+ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 #: a rival within these odds of the best makes the slice ambiguous (contract §5)
 RIVAL_ODDS = 100.0
 #: ... when its pose is farther off than this many standard deviations (contract §5)
@@ -40,6 +43,8 @@ WEAK_CONDITION = 60.0
 _WORTH_SAYING = 1e-3
 #: matches below which nothing can be checked: three spots always fit
 LEAST_MATCHES = 4
+#: spots or rods up to which a match of four is looked for
+_FEW = 6
 
 
 def pose_prior(model: RodModel, T_patient_slice: FloatArray | None, options: RegistrationOptions) -> PosePrior:
@@ -107,11 +112,18 @@ def register(
     )
     if len(spots) < LEAST_MATCHES:
         return Registration(status="no_pose", reason="too_few_spots", n_spots=len(spots))
-    matches = search(model, scene, least_matches=LEAST_MATCHES)
+    # a match of four among many spots could never be believed: do not look for it
+    least = LEAST_MATCHES if min(len(spots), len(model)) <= _FEW else LEAST_MATCHES + 1
+    matches = search(model, scene, least_matches=least)
     if matches is None:
         return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
-    matches = doubt(model, scene, matches, least_matches=LEAST_MATCHES)
+    matches = doubt(model, scene, matches, least_matches=least)
     return decide(model, scene, spots, scale, matches)
+
+
+def accepted_log_odds(n_matches: int) -> float:
+    """The ln odds that a match of so many spots must exceed."""
+    return ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
 
 
 def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches) -> Registration:
@@ -125,9 +137,9 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
 
     if len(best.rod_index) < len(best.missing_rods):
         return refused("no_consistent_match")
-    if best.log_odds < ACCEPT_LOG_ODDS:
+    if best.log_odds < accepted_log_odds(len(best.rod_index)):
         return refused("no_consistent_match")
-    if chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P:
+    if chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P:
         return refused("bad_fit")
     doubts = [c for c in candidates[1:] if _knows_less(c, best)]
     rivals = [c for c in candidates[1:] if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
@@ -224,7 +236,7 @@ def assemble_candidate(
     dof = 2 * len(rods) - 6
     chi2 = float(fit.chi2[0])
     inflation = 1.0
-    if dof > 0 and chi2_distribution.sf(chi2, dof) < INFLATE_P:
+    if dof > 0 and chdtrc(dof, chi2) < INFLATE_P:
         inflation = math.sqrt(chi2 / dof)
     return Candidate(
         T_slice_model=frozen(T, (4, 4)),

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
@@ -24,8 +24,8 @@ from ctreg_cli.registration.matching import Scene, assign, nearest_assignment, o
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.registration.refine import covariance_from_information, linearise
 from ctreg_cli.registration.register import (
-    ACCEPT_LOG_ODDS,
     BAD_FIT_P,
+    accepted_log_odds,
     assemble_candidate,
     fit_warnings,
     make_scene,
@@ -283,9 +283,9 @@ class Tracker:
             model, spots, scale, T, fit, spot_of_rod[0], must[0], covariance, float(odds[0]), iterations
         )
         if (
-            best.log_odds < ACCEPT_LOG_ODDS
+            best.log_odds < accepted_log_odds(len(best.rod_index))
             or len(best.rod_index) < max(_LEAST_MATCHES, len(best.missing_rods))
-            or chi2_distribution.sf(best.chi2, best.degrees_of_freedom) < BAD_FIT_P
+            or chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P
         ):
             return None
         registration = Registration(
