@@ -11,8 +11,8 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
-#: heights at which a blob is searched for a valley through it; it must stand above so many times its ring's spread
-SPLIT_LEVELS, SPLIT_CONTRAST = (0.65, 0.85), 12.0
+#: heights at which a blob is searched for a valley through it; how deep it must be, in spreads of the blob's ring
+SPLIT_LEVELS, SPLIT_DEPTH = (0.65, 0.85), 6.0
 #: width of the background that must be seen between a blob and the edge of its window, px
 BACKGROUND_PX = 4.0
 #: a window is moved to its blob's centre at most so often; once is nearly always enough
@@ -118,9 +118,12 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
     height = above.reshape(k, -1)[np.arange(k), peak]
     bright = above > 0.5 * height[:, None, None]
     own = _joined_to(bright, peak)
-    clear = np.flatnonzero(height > SPLIT_CONTRAST * _spread(values.reshape(k, -1)[:, ring(radius)], background))
-    if len(clear):
-        own[clear] = _apart_from_neighbour(above[clear], height[clear], own[clear], peak[clear])
+    spread = _spread(values.reshape(k, -1)[:, ring(radius)], background)
+    for level in SPLIT_LEVELS:
+        clear = np.flatnonzero((1.0 - level) * height > SPLIT_DEPTH * spread)
+        if len(clear):
+            high = above[clear] > level * height[clear, None, None]
+            own[clear] = _apart_from_neighbour(own[clear], own[clear] & high, peak[clear])
     count = np.maximum(own.sum(axis=(1, 2)), 1)
     flat = own.reshape(k, -1).astype(np.float64)
     basis = np.stack([u, v, u * u, u * v, v * v]).reshape(5, -1)
@@ -147,24 +150,23 @@ def _spread(ring_values: FloatArray, background: FloatArray) -> FloatArray:
     return np.asarray(background - np.nan_to_num(nan_quantile(ring_values, 1.0 - BACKGROUND_QUANTILE))) / 2
 
 
-def _apart_from_neighbour(above: FloatArray, height: FloatArray, own: BoolArray, seed: IntArray) -> BoolArray:
-    """Blobs (k, n, n) without the part beyond a valley: there another spot begins, whose tail fills the valley up."""
-    for level in SPLIT_LEVELS:
-        high = own & (above > level * height[:, None, None])
-        mine = _joined_to(high, seed)
-        other = high & ~mine
-        split = np.flatnonzero(other.any(axis=(1, 2)))
-        if not len(split):
-            continue
-        mine, other, whole = mine[split], other[split], own[split]
-        while True:  # both parts grow in turn until they share the blob out
-            grown = dilated(mine) & whole & ~other
-            beyond = dilated(other) & whole & ~grown
-            if (grown == mine).all() and (beyond == other).all():
-                break
-            mine, other = grown, beyond
-        own = own.copy()
-        own[split] = mine
+def _apart_from_neighbour(own: BoolArray, high: BoolArray, seed: IntArray) -> BoolArray:
+    """Blobs (k, n, n) without what belongs to another peak, if their ``high`` parts hang together only below a valley.
+
+    There another spot begins, whose tail has filled the valley up.
+    """
+    mine = _joined_to(high, seed)
+    split = np.flatnonzero((high & ~mine).any(axis=(1, 2)))
+    if not len(split):
+        return own
+    whole, mine, other = own[split], mine[split], (high & ~mine)[split]
+    while True:  # both parts grow in turn until they share the blob out
+        grown = dilated(mine) & whole & ~other
+        beyond = dilated(other) & whole & ~grown
+        if (grown == mine).all() and (beyond == other).all():
+            break
+        mine, other = grown, beyond
+    own[split] = mine
     return own
 
 

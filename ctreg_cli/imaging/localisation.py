@@ -19,7 +19,7 @@ from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, 
 from ctreg_cli.imaging.window import dilated, disc, grid, nan_quantile, ring
 
 #: steps of the fit at most; a centre that moves by less than this (px) is done, whatever the others do
-ITERATIONS, DONE_PX = 6, 2e-4
+ITERATIONS, DONE_PX = 5, 2e-4
 #: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
 STRUCTURE_WEIGHT = 3.0
 #: correlation length of background structure, px: the width of streaks, which the same blur has made as the spots
@@ -34,18 +34,23 @@ MIN_CLIPPED_PX = 3
 ODD, LEAST_KEPT = [0, 1, 4, 5], 0.2
 #: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
 MODEL_SD_PX = 0.005
+#: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
+START_BLUR_PX2 = 0.1
+#: start of ln β, between a Gaussian and a flat top, and its range: from tails heavier than a Gaussian's to nearly a box
+START_LOG_BETA, LOG_BETA_RANGE = 0.15, (-0.5, 1.5)
+#: inverse variances (10,) of the parameters about their start: the shape is known within a factor of two; a trace of
+#: certainty about the rest keeps the matrix regular where a window is all padding
+PRIOR = np.array([1e-9] * 2 + [0.7**-2] + [1e-9] * 3 + [0.7**-2] * 3 + [0.5**-2])
+#: farthest from the start (10,): px for the centre, a factor of eight for height and shape
+MAX_CHANGE = np.array([2.0] * 2 + [2.0] + [np.inf] * 3 + [2.0] * 4)
+#: Levenberg–Marquardt damping
+FIRST_DAMPING, DAMPING_FACTOR = 1e-3, 10.0
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
 MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
 #: sd of a normal distribution over its median absolute deviation
 MAD_TO_SD = 1.4826
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
-#: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
-START_BLUR_PX2 = 0.1
-#: start and width (sd) of ln β: between a Gaussian and a flat top; and the sd of the logarithms of height and size
-START_LOG_BETA = 0.15
-SD_LOG_BETA = 0.5
-SD_LOG_SHAPE = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -174,51 +179,51 @@ def _start(blobs: Blobs, n_clipped: IntArray) -> FloatArray:
 def _levenberg_marquardt(
     start: FloatArray, u: FloatArray, v: FloatArray, values: FloatArray, clipped: BoolArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Parameters, residuals, Jacobian and normal matrix at the minimum of Σ w r² plus weak priors on the shape."""
+    """Parameters, residuals, Jacobian and normal matrix at the minimum of Σ w r² plus weak priors on the shape.
+
+    Every spot has its own damping and stops on its own, so that its centre does not depend on who is fitted beside it.
+    """
     k = len(start)
-    prior = np.zeros(N_PARAMETERS)
-    prior[SHAPE], prior[LOG_HEIGHT], prior[LOG_BETA] = 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_SHAPE**2, 1 / SD_LOG_BETA**2
-    low, high = start - 3 * SD_LOG_SHAPE, start + 3 * SD_LOG_SHAPE
-    low[:, BACKGROUND : SHAPE.start], high[:, BACKGROUND : SHAPE.start] = -np.inf, np.inf
-    low[:, LOG_BETA], high[:, LOG_BETA] = -0.5, 1.5
-    diagonal = np.arange(N_PARAMETERS)
+    low, high = start - MAX_CHANGE, start + MAX_CHANGE
+    low[:, LOG_BETA], high[:, LOG_BETA] = LOG_BETA_RANGE
 
-    def cost_of(residuals: FloatArray, parameters: FloatArray) -> FloatArray:
-        total: FloatArray = (weights * residuals**2).sum(axis=1) + (prior * (parameters - start) ** 2).sum(axis=1)
-        return total
+    def attempt(parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        residuals, jacobian = evaluate(parameters, u, v, values, clipped)
+        cost = (weights * residuals**2).sum(axis=1) + (PRIOR * (parameters - start) ** 2).sum(axis=1)
+        return parameters, residuals, jacobian, cost
 
-    parameters, damping, done = start, np.full(k, 1e-3), np.zeros(k, dtype=bool)
-    residuals, jacobian = evaluate(parameters, u, v, values, clipped)
-    cost = cost_of(residuals, parameters)
+    best = attempt(start)
+    damping, done = np.full(k, FIRST_DAMPING), np.zeros(k, dtype=bool)
     for _ in range(ITERATIONS):
-        normal, gradient = _normal_equations(jacobian, weights, residuals)
-        normal[:, diagonal, diagonal] += prior + 1e-9
-        gradient -= prior * (parameters - start)
-        damped = normal.copy()
-        damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-        trial = np.clip(parameters + step, low, high)
-        trial_residuals, trial_jacobian = evaluate(trial, u, v, values, clipped)
-        trial_cost = cost_of(trial_residuals, trial)
-        better = (trial_cost <= cost) & ~done
+        parameters, residuals, jacobian, cost = best
+        normal = _normal_matrix(jacobian, weights)
+        gradient = (jacobian @ (weights * residuals)[:, :, None])[:, :, 0] - PRIOR * (parameters - start)
+        normal *= 1.0 + damping[:, None, None] * np.eye(N_PARAMETERS)
+        step = np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
+        trial = attempt(np.clip(parameters + step, low, high))
+        better = (trial[-1] <= cost) & ~done
         done |= better & (np.abs(step[:, CENTRE]).max(axis=1) < DONE_PX)
-        damping *= np.where(better, 0.1, 10.0)
-        parameters = np.where(better[:, None], trial, parameters)
-        residuals = np.where(better[:, None], trial_residuals, residuals)
-        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
-        cost = np.where(better, trial_cost, cost)
+        damping *= np.where(better, 1 / DAMPING_FACTOR, DAMPING_FACTOR)
+        best = trial if better.all() else _chosen(better, trial, best)
         if done.all():
             break
-    normal, _ = _normal_equations(jacobian, weights, residuals)
-    normal[:, diagonal, diagonal] += prior + 1e-9
-    return parameters, residuals, jacobian, normal
+    parameters, residuals, jacobian, _ = best
+    return parameters, residuals, jacobian, _normal_matrix(jacobian, weights)
 
 
-def _normal_equations(
-    jacobian: FloatArray, weights: FloatArray, residuals: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    weighted = jacobian * weights[:, None]
-    return weighted @ jacobian.transpose(0, 2, 1), (weighted @ residuals[:, :, None])[:, :, 0]
+def _chosen(
+    which: BoolArray, these: tuple[FloatArray, ...], others: tuple[FloatArray, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Rows of ``these`` where ``which`` (k,) holds, of ``others`` elsewhere."""
+    a, b, c, d = (
+        np.where(which.reshape(-1, *(1,) * (this.ndim - 1)), this, other)
+        for this, other in zip(these, others, strict=True)
+    )
+    return a, b, c, d
+
+
+def _normal_matrix(jacobian: FloatArray, weights: FloatArray) -> FloatArray:
+    return np.asarray((jacobian * weights[:, None]) @ jacobian.transpose(0, 2, 1) + np.diag(PRIOR))
 
 
 def _seen_noise(influence: FloatArray, noise: FloatArray) -> FloatArray:

@@ -45,12 +45,13 @@ def evaluate(
     x, y = u - centre_u, v - centre_v
     xi, eta = scale_u * x, l1 * x + scale_v * y
     q = xi * xi + eta * eta + _TINY
-    q_beta = q**beta
+    log_q = np.log(q)
+    q_beta = np.exp(beta * log_q)
     spot = np.exp(log_height - _LN2 * q_beta)
     residuals = values - (spot + background + g_u * u + g_v * v)
-    active = ~(clipped & (residuals <= 0))
-    half_dq = (-_LN2) * beta * spot * q_beta / q  # ∂I/∂q; the 2 of ∂q/∂ξ = 2ξ follows in the next line
-    d_xi, d_eta = 2 * half_dq * xi, 2 * half_dq * eta
+    steepness = _LN2 * beta * spot * q_beta
+    d_q = -2 * steepness / q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
+    d_xi, d_eta = d_q * xi, d_q * eta
     jacobian = np.empty((len(parameters), N_PARAMETERS, u.size))
     jacobian[:, 0] = -(d_xi * scale_u + d_eta * l1)
     jacobian[:, 1] = -d_eta * scale_v
@@ -61,5 +62,9 @@ def evaluate(
     jacobian[:, 6] = d_xi * xi
     jacobian[:, 7] = d_eta * x
     jacobian[:, 8] = d_eta * scale_v * y
-    jacobian[:, LOG_BETA] = -_LN2 * beta * spot * q_beta * np.log(q)
-    return residuals * active, jacobian * active[:, None]
+    jacobian[:, LOG_BETA] = -steepness * log_q
+    satisfied = clipped & (residuals <= 0)
+    if satisfied.any():
+        residuals[satisfied] = 0.0
+        jacobian *= ~satisfied[:, None]
+    return residuals, jacobian
