@@ -12,8 +12,8 @@ The pose is integrated out over its prior by Laplace's method, which charges a m
     ln E = ln π(θ) + 3 ln 2π + ½ ln|C| + Σ_i [ln p − ½ r_iᵀ S_i⁻¹ r_i − ln 2π − ½ ln|S_i|]
            + n ln A + ln Γ(m − n + ½) − ln Γ(m + ½) + q ln(1 − p)
 
-with C the pose covariance and π(θ) the prior density (uniform in position over the searched field, uniform in rotation over
-all of SO(3), or over the mount's cone). ``Γ(m + ½)/Γ(m − n + ½)`` is the number of ways to pick the n spots. Under *chance*
+with C the pose covariance and π(θ) the prior density (uniform in position over the searched field; rotation: see
+:class:`PosePrior`). ``Γ(m + ½)/Γ(m − n + ½)`` is the number of ways to pick the n spots. Under *chance*
 the sum of E over all matches and poses has the mean 1, so by Markov's inequality a slice of pure clutter reaches ln E > x
 with a probability of at most exp(−x); ``benchmarks/accuracy.py`` measures it.
 """
@@ -39,18 +39,39 @@ _NEIGHBOURHOOD = 1.25
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosePrior:
-    """What is known of the pose before looking at the spots: a cone of rotations about a nominal one, or nothing."""
+    """What is known of the pose before looking at the spots.
+
+    Either a cone of rotations about a nominal one (the frame's mount), every one in it alike; or nothing but that a frame
+    is built to be cut across its rods: the tilt of their common axis against the slice normal is small more often than not.
+    Any other pose stays possible.
+    """
 
     #: (3, 3) nominal rotation model → slice; None: any
     rotation: FloatArray | None = None
     max_angle_rad: float = math.pi
+    #: (3,) the rods' common axis in the model, and how common it is: 0 (rods in all directions) to 1 (all parallel)
+    axis: FloatArray | None = None
+    axis_share: float = 0.0
 
-    @property
-    def rotation_volume(self) -> float:
-        """Volume of the allowed rotations in rad³ (all of SO(3): 8π²)."""
-        if self.rotation is None:
-            return 8 * math.pi**2
-        return 8 * math.pi * (self.max_angle_rad - math.sin(self.max_angle_rad))
+    @classmethod
+    def of_rods(cls, directions: FloatArray) -> PosePrior:
+        """The prior of a frame without a mount, from its rods' directions (n, 3)."""
+        values, vectors = np.linalg.eigh(directions.T @ directions / len(directions))
+        share = max(0.0, (float(values[-1]) - 1 / 3) * 1.5)
+        return cls(axis=vectors[:, -1], axis_share=share)
+
+    def log_density(self, R: FloatArray) -> FloatArray:
+        """ln of the prior density (...,) per rad³ at rotations (..., 3, 3)."""
+        if self.rotation is not None:
+            volume = 8 * math.pi * (self.max_angle_rad - math.sin(self.max_angle_rad))
+            return np.full(R.shape[:-2], -math.log(volume))
+        uniform = np.full(R.shape[:-2], 1.0)
+        if self.axis is not None:
+            tilt = np.arccos(np.clip(np.abs(R[..., 2, :] @ self.axis), 0, 1))
+            share = self.axis_share * _UPRIGHT_SHARE
+            uniform = (1 - share) + share * np.exp(-0.5 * (tilt / _UPRIGHT_SD_RAD) ** 2) / _UPRIGHT_MEAN
+        density: FloatArray = np.log(uniform) - math.log(8 * math.pi**2)
+        return density
 
     def allows(self, R: FloatArray) -> BoolArray:
         """Which rotations (..., 3, 3) lie within the cone."""
@@ -58,6 +79,13 @@ class PosePrior:
             return np.ones(R.shape[:-2], dtype=bool)
         inside: BoolArray = rotation_angle(R @ self.rotation.T) <= self.max_angle_rad
         return inside
+
+
+#: how often a frame of parallel rods is cut across them, and how steeply then
+_UPRIGHT_SHARE, _UPRIGHT_SD_RAD = 0.9, 0.45
+_tilts = np.linspace(0, math.pi / 2, 2001)
+#: mean of the bell over the sphere, so that the density stays one
+_UPRIGHT_MEAN = float(np.mean(np.exp(-0.5 * (_tilts / _UPRIGHT_SD_RAD) ** 2) * np.sin(_tilts)) * math.pi / 2)
 
 
 def log_odds(
@@ -101,7 +129,7 @@ def log_odds(
     H, _ = fit.normal_equations()
     C, _ = covariance_from_information(H, model.size_mm)
     # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not 10⁶
-    log_prior = -np.log(field * 2 * model.size_mm * prior.rotation_volume)
+    log_prior = prior.log_density(T[:, :3, :3]) - np.log(field * 2 * model.size_mm)
     if log_prior_density is not None:
         log_prior = log_prior_density
     _, logdet = np.linalg.slogdet(C)

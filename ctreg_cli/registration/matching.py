@@ -199,8 +199,8 @@ def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[In
         sets = np.zeros((math.comb(n, k), n), dtype=bool)
         for row, members in enumerate(itertools.combinations(range(n), k)):
             sets[row, list(members)] = True
-        holds = sets[:, triples].all(axis=2)  # (sets, triples)
-        open_sets: BoolArray = holds[:, np.array(chosen, dtype=np.intp)].sum(axis=1) == 0
+        holds: BoolArray = np.logical_and.reduce(sets[:, triples], axis=2)  # (sets, triples)
+        open_sets: BoolArray = ~np.logical_or.reduce(holds[:, np.array(chosen, dtype=np.intp)], axis=1)
         while open_sets.any():
             gain = holds[open_sets].sum(axis=0) * (1e-3 + strength / strength.max()) * free
             best = int(gain.argmax())

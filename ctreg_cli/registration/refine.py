@@ -181,7 +181,7 @@ def covariance_from_information(H: FloatArray, size_mm: float) -> tuple[FloatArr
     singular = values <= 1e-12 * largest
     variance = np.where(singular, 1e6, 1 / np.maximum(values, 1e-300))
     scaled = (vectors * variance[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    condition = np.sqrt(largest[..., 0] / np.maximum(values[..., 0], 1e-30 * largest[..., 0]))
+    condition = np.sqrt(largest[..., 0] / np.maximum(values[..., 0], 1e-24 * largest[..., 0] + 1e-300))
     return scaled * (unit[:, None] * unit), np.where(singular.any(axis=-1), np.inf, condition)
 
 

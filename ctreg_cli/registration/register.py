@@ -35,12 +35,17 @@ RIVAL_ODDS = 100.0
 RIVAL_SD = 6.0
 #: a fit with a smaller χ² probability is refused
 BAD_FIT_P = 1e-4
+#: spots beside the places of missing rods: refused when chance would put them so near less often than this
+NEAR_MISS_P = 1e-3
 #: a fit with a smaller χ² probability has its standard deviations widened
 INFLATE_P = 1e-2
 #: beyond this condition number (rotation in frame sizes) the weak direction is named in a warning
 WEAK_CONDITION = 60.0
 #: probability of a false match beyond which it is mentioned
 _WORTH_SAYING = 1e-3
+#: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
+#: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
+_UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
 #: matches below which nothing can be checked: three spots always fit
 LEAST_MATCHES = 4
 #: spots or rods up to which a match of four is looked for
@@ -50,7 +55,7 @@ _FEW = 6
 def pose_prior(model: RodModel, T_patient_slice: FloatArray | None, options: RegistrationOptions) -> PosePrior:
     """The mount of the frame file as a cone of rotations model → slice."""
     if model.mount is None or not options.use_mount:
-        return PosePrior()
+        return PosePrior.of_rods(model.directions)
     R = np.asarray(model.mount.patient_from_model, dtype=np.float64)
     if T_patient_slice is not None:
         R = T_patient_slice[:3, :3].T @ R
@@ -141,6 +146,10 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
         return refused("no_consistent_match")
     if chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P:
         return refused("bad_fit")
+    if near_misses_p(scene, scale, best) < NEAR_MISS_P:
+        return refused("bad_fit")
+    if undetermined(model, best.covariance):
+        return refused("singular_geometry")
     doubts = [c for c in candidates[1:] if _knows_less(c, best)]
     rivals = [c for c in candidates[1:] if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
     warnings: list[tuple[str, str]] = []
@@ -168,6 +177,45 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
             warnings=tuple(warnings),
         )
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
+
+
+def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
+    """Probability that chance puts unmatched spots as near the places of missing rods as they are; 1 if none are missing.
+
+    When spots are worse than they say, or the frame is not its drawing, a few of the rods can always be made to fit, and
+    the others lie just beside their places. One such spot is forgiven (a streak, a neighbour moved it), two are a pattern:
+    Fisher's method over the distances to the nearest free spot, the smallest left out.
+    """
+    if len(best.missing_rods) < 2:
+        return 1.0
+    free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_index)
+    if len(free) == 0:
+        return 1.0
+    missing_mm = best.missing_px * scale.mm_per_px
+    seen_mm = scene.xy_mm[best.spot_index]
+    centre = np.concatenate([missing_mm, seen_mm]).mean(axis=0)
+    reach = float(np.linalg.norm(np.concatenate([missing_mm, seen_mm]) - centre, axis=1).max())
+    around = np.linalg.norm(scene.xy_mm[free] - centre, axis=1) <= 1.25 * reach
+    density = max(int(around.sum()), 1) / (math.pi * (1.25 * reach) ** 2)
+    gap = np.linalg.norm(scene.xy_mm[free][None] - missing_mm[:, None], axis=-1)
+    # one spot answers for one rod only
+    nearest: list[float] = []
+    while min(gap.shape) and np.isfinite(gap.min()):
+        rod, spot = np.unravel_index(int(gap.argmin()), gap.shape)
+        nearest.append(float(gap[rod, spot]))
+        gap[rod], gap[:, spot] = np.inf, np.inf
+    p = -np.expm1(-density * math.pi * np.square(np.sort(nearest)[1:]))
+    if len(p) == 0:
+        return 1.0
+    return float(chdtrc(2 * len(p), -2 * np.log(np.maximum(p, 1e-300)).sum()))
+
+
+def undetermined(model: RodModel, covariance: FloatArray) -> bool:
+    """Whether some direction of the pose is not known at all, at the frame's centre or in its rotation."""
+    rotation = math.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
+    place = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
+    reach = model.size_mm + float(np.linalg.norm(model.centre))
+    return rotation > _UNKNOWN_ROTATION or place > _UNKNOWN_PLACE * reach
 
 
 def fit_warnings(model: RodModel, spots: Spots, best: Candidate) -> tuple[tuple[str, str], ...]:
@@ -232,6 +280,7 @@ def assemble_candidate(
 ) -> Candidate:
     """Put a one-hypothesis fit (in millimetres) into a :class:`Candidate` (in pixels)."""
     rods = np.nonzero(spot_of_rod >= 0)[0]
+    missing = np.nonzero(expected & (spot_of_rod < 0))[0]
     residual = fit.residual_px[0, rods] / scale.mm_per_px
     dof = 2 * len(rods) - 6
     chi2 = float(fit.chi2[0])
@@ -245,7 +294,8 @@ def assemble_candidate(
         spot_index=frozen_index(spot_of_rod[rods]),
         residual_px=frozen(residual, (None, 2)),
         lambda_mm=frozen(fit.lambda_mm[0, rods], (None,)),
-        missing_rods=frozen_index(np.nonzero(expected & (spot_of_rod < 0))[0]),
+        missing_rods=frozen_index(missing),
+        missing_px=frozen(fit.predicted_px[0, missing] / scale.mm_per_px, (None, 2)),
         rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else 0.0,
         chi2=chi2,
         degrees_of_freedom=dof,

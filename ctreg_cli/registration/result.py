@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
 
@@ -27,6 +29,8 @@ class Candidate:
     lambda_mm: FloatArray
     #: (r,) rods the pose says should be seen, and no spot was matched to
     missing_rods: IntArray
+    #: (r, 2) where those rods should be seen, px
+    missing_px: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     #: root mean square of ``residual_px`` over both coordinates and all matches, px
     rms_px: float
     #: χ² of the residuals (spot covariance and frame tolerance) and its degrees of freedom

@@ -1,0 +1,56 @@
+"""Frames and slices for these tests, from the oracle's world into the package's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ctreg_cli.imaging.slice import SliceInfo
+from ctreg_cli.imaging.spot_slice import SpotSlice
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.register import register
+from ctreg_cli.registration.result import Registration
+from ctreg_cli.rods import Mount, Rod, RodModel
+from ctreg_cli.scale import Scale
+from tests.oracle import OracleFrame, OracleScene, scene
+
+
+def model_of(frame: OracleFrame, *, tolerance_mm: float = 0.0, mount: Mount | None = None) -> RodModel:
+    """The oracle's frame as a rod model."""
+    rods = tuple(
+        Rod(id=f"r{i}", start=a, end=b, tolerance_mm=tolerance_mm)
+        for i, (a, b) in enumerate(zip(frame.starts, frame.ends, strict=True))
+    )
+    return RodModel(name="oracle", rods=rods, mount=mount)
+
+
+def frame_of(model: RodModel) -> OracleFrame:
+    """A rod model as the oracle's frame."""
+    return OracleFrame(np.array(model.starts), np.array(model.ends))
+
+
+def some_scene(rng: np.random.Generator, frame: OracleFrame, **options: object) -> OracleScene:
+    """A scene in which enough rods are cut."""
+    while True:
+        result = scene(rng, frame, **options)  # type: ignore[arg-type]
+        if result is not None:
+            return result
+
+
+def spots_of(world: OracleScene) -> Spots:
+    """Its spots, with their true sd."""
+    return Spots.from_points(world.uv_px, world.sd_px)
+
+
+def scale_of(world: OracleScene) -> Scale:
+    """Its scale."""
+    return Scale(s_x=float(world.mm_per_px[0]), s_y=float(world.mm_per_px[1]))
+
+
+def registered(world: OracleScene, model: RodModel) -> Registration:
+    """The package's verdict on it."""
+    return register(spots_of(world), model, scale=scale_of(world))
+
+
+def slice_of(world: OracleScene, *, scale: Scale | None) -> SpotSlice:
+    """Its spots as a slice that says this scale, or none."""
+    return SpotSlice(info=SliceInfo(source="oracle", scale=scale), spots=spots_of(world))

@@ -1,0 +1,240 @@
+"""Registration of unlabelled spots: right where it says ``ok``, honest where it cannot know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.io.rod_file import load_rod_model
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.register import register
+from ctreg_cli.scale import Scale
+from tests.oracle import OracleFrame, OracleScene, bound, random_frame, twist_error
+from tests.registration.frames import frame_of, model_of, registered, scale_of, some_scene, spots_of
+
+CUBE = load_rod_model("rod-cube-30x30x40")
+
+
+def error_of(T: np.ndarray, world: OracleScene) -> np.ndarray:
+    return twist_error(T[:3, :3], T[:3, 3], world.R, world.t)
+
+
+def labels_right(registration: object, world: OracleScene) -> bool:
+    best = registration.best  # type: ignore[attr-defined]
+    return all(world.rod_of_spot[s] == r for s, r in zip(best.spot_index, best.rod_index, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_sharp_spots_give_the_true_pose(seed: int) -> None:
+    rng = np.random.default_rng([801, seed])
+    frame = random_frame(rng, int(rng.integers(6, 10)))
+    world = some_scene(rng, frame, sd_px=0.002, mm_per_px=(0.45, 0.6), least=6)
+    result = registered(world, model_of(frame))
+    assert result.status == "ok", (seed, result.reason)
+    assert labels_right(result, world)
+    error = error_of(result.candidates[0].T_slice_model, world)
+    assert np.sqrt(error @ np.linalg.pinv(world.bound) @ error) < 6, seed
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_missing_rods_and_false_spots_are_found_out(seed: int) -> None:
+    rng = np.random.default_rng([802, seed])
+    world = some_scene(rng, frame_of(CUBE), sd_px=0.05, missing=1, false=5, least=6)
+    result = registered(world, CUBE)
+    assert result.status == "ok", (seed, result.reason)
+    assert labels_right(result, world)
+    seen = set(world.rod_of_spot.tolist()) - {-1}
+    assert set(result.candidates[0].rod_index.tolist()) == seen
+
+
+def test_the_order_of_spots_does_not_matter() -> None:
+    rng = np.random.default_rng(803)
+    world = some_scene(rng, frame_of(CUBE), sd_px=0.05, false=3, least=8)
+    first = registered(world, CUBE).candidates[0]
+    order = rng.permutation(len(world.uv_px))
+    again = register(Spots.from_points(world.uv_px[order], 0.05), CUBE, scale=scale_of(world)).candidates[0]
+    np.testing.assert_allclose(again.T_slice_model, first.T_slice_model, atol=1e-6)
+    assert {(r, order[s]) for r, s in zip(again.rod_index, again.spot_index, strict=True)} == {
+        (r, s) for r, s in zip(first.rod_index, first.spot_index, strict=True)
+    }
+
+
+def test_a_shifted_image_shifts_the_pose_and_nothing_else() -> None:
+    rng = np.random.default_rng(804)
+    world = some_scene(rng, frame_of(CUBE), sd_px=0.05, mm_per_px=(0.4, 0.55), least=8)
+    shift = np.array([31.0, -12.5])
+    first = registered(world, CUBE).candidates[0]
+    moved = register(Spots.from_points(world.uv_px + shift, 0.05), CUBE, scale=scale_of(world)).candidates[0]
+    expected = np.array(first.T_slice_model)
+    expected[:2, 3] += shift * world.mm_per_px
+    np.testing.assert_allclose(moved.T_slice_model, expected, atol=1e-6)
+    np.testing.assert_allclose(moved.covariance, first.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_errors_are_as_large_as_the_covariance_says_and_as_the_bound_allows() -> None:
+    rng = np.random.default_rng(805)
+    own, ideal = [], []
+    for _ in range(150):
+        world = some_scene(rng, frame_of(CUBE), sd_px=0.1, least=8)
+        result = registered(world, CUBE)
+        assert result.status == "ok"
+        best = result.candidates[0]
+        error = error_of(best.T_slice_model, world)
+        own.append(error @ np.linalg.inv(best.covariance) @ error)
+        ideal.append(error @ np.linalg.inv(world.bound) @ error)
+    # χ² of 6 degrees: mean 6, sd of the mean √12/√150 = 0.28; three of them
+    assert abs(np.mean(own) - 6) < 0.85, np.mean(own)
+    assert abs(np.mean(ideal) - 6) < 0.85, np.mean(ideal)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_pure_clutter_is_never_a_pose(seed: int) -> None:
+    rng = np.random.default_rng([806, seed])
+    uv = 250 + rng.uniform(-45, 45, (int(rng.integers(3, 25)), 2))
+    result = register(Spots.from_points(uv, float(rng.choice([0.05, 0.3]))), CUBE, scale=Scale(s_x=0.5, s_y=0.5))
+    assert result.status != "ok", seed
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_spots_of_another_frame_are_not_ours(seed: int) -> None:
+    rng = np.random.default_rng([807, seed])
+    world = some_scene(rng, random_frame(rng, 8), sd_px=0.05, least=8)
+    assert registered(world, CUBE).status != "ok", seed
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3])
+def test_too_few_spots_are_said_to_be_too_few(n: int) -> None:
+    uv = 100.0 + 20 * np.arange(2 * n).reshape(n, 2)
+    result = register(Spots.from_points(uv), CUBE, scale=Scale(s_x=0.5, s_y=0.5))
+    assert (result.status, result.reason, result.n_spots) == ("no_pose", "too_few_spots", n)
+
+
+@pytest.mark.parametrize("name", ["leksell-g-2-panel", "z-frame-z001"])
+def test_a_symmetric_frame_is_ambiguous_until_its_mount_is_obeyed(name: str) -> None:
+    rng = np.random.default_rng(808)
+    model = load_rod_model(name)
+    assert model.mount is not None
+    frame = frame_of(model)
+    along = np.linalg.svd(model.directions)[2][0]
+    for _ in range(3):
+        R = poses.exp_rotation(rng.normal(size=3) * 0.08) @ np.asarray(model.mount.patient_from_model)
+        # the slice a little off the middle, across the rods
+        t = np.array([120.0, 130.0, 0.0]) - R @ (model.centre + 4.0 * along)
+        spots = []
+        for a, b in zip(frame.starts, frame.ends, strict=True):
+            p, q = R @ a + t, R @ b + t
+            if (p[2] > 0) != (q[2] > 0):
+                spots.append((p + p[2] / (p[2] - q[2]) * (q - p))[:2] / 0.6)
+        uv = np.array(spots) + rng.normal(size=(len(spots), 2)) * 0.05
+        scale = Scale(s_x=0.6, s_y=0.6)
+        free = register(Spots.from_points(uv, 0.05), model, scale=scale, options=RegistrationOptions(use_mount=False))
+        assert free.status == "ambiguous", (name, free.reason)
+        assert len(free.candidates) >= 2
+        turn = poses.rotation_angle(free.candidates[0].T_slice_model[:3, :3] @ free.candidates[1].T_slice_model[:3, :3].T)
+        assert turn > np.radians(60)
+        settled = register(Spots.from_points(uv, 0.05), model, scale=scale)
+        assert settled.status == "ok", (name, settled.reason)
+        error = twist_error(settled.candidates[0].T_slice_model[:3, :3], settled.candidates[0].T_slice_model[:3, 3], R, t)
+        assert np.linalg.norm(error[3:]) < np.radians(3)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_one_spot_far_off_does_not_move_the_pose(seed: int) -> None:
+    rng = np.random.default_rng([809, seed])
+    world = some_scene(rng, frame_of(CUBE), sd_px=0.1, least=8)
+    clean = registered(world, CUBE).candidates[0]
+    uv = np.array(world.uv_px)
+    angle = rng.uniform(0, 2 * np.pi)
+    uv[int(rng.integers(len(uv)))] += 3 * np.array([np.cos(angle), np.sin(angle)])
+    result = register(Spots.from_points(uv, 0.1), CUBE, scale=scale_of(world))
+    assert result.status in ("ok", "ambiguous"), (seed, result.reason)
+    if result.status == "ok":
+        twist = poses.difference(result.candidates[0].T_slice_model, clean.T_slice_model)
+        sd = np.sqrt(np.diag(result.candidates[0].covariance))
+        assert (np.abs(twist) < 3 * sd).all(), seed
+
+
+def test_spots_worse_than_they_say_are_not_believed() -> None:
+    rng = np.random.default_rng(810)
+    for _ in range(10):
+        world = some_scene(rng, frame_of(CUBE), sd_px=0.5, least=8)
+        result = register(Spots.from_points(world.uv_px, 0.05), CUBE, scale=scale_of(world))
+        if result.status == "ok":  # then only with an sd that owns up to it
+            best = result.candidates[0]
+            error = error_of(best.T_slice_model, world)
+            assert np.sqrt(error @ np.linalg.inv(best.covariance) @ error) < 6
+
+
+def test_a_wrong_scale_is_not_a_small_sd() -> None:
+    rng = np.random.default_rng(811)
+    for _ in range(10):
+        world = some_scene(rng, frame_of(CUBE), sd_px=0.05, least=8)
+        s = scale_of(world)
+        result = register(spots_of(world), CUBE, scale=Scale(s_x=s.s_x * 1.02, s_y=s.s_y * 1.02))
+        if result.status == "ok":
+            best = result.candidates[0]
+            error = error_of(best.T_slice_model, world)
+            error[:2] -= 0.02 * world.t[:2]  # where the origin is, moves with the scale
+            assert np.sqrt(error @ np.linalg.inv(best.covariance) @ error) < 6
+
+
+def test_a_frame_off_its_drawing_is_known_by_its_tolerance() -> None:
+    rng = np.random.default_rng(812)
+    drawn = random_frame(rng, 9, size=150, height=120)
+    model = model_of(drawn, tolerance_mm=0.4)
+    squares = []
+    for _ in range(40):
+        offset = rng.normal(size=drawn.starts.shape) * 0.4
+        built = OracleFrame(drawn.starts + offset, drawn.ends + offset)
+        world = some_scene(rng, built, sd_px=0.05, least=8, tilt_rad=0.1)
+        result = registered(world, model)
+        assert result.status in ("ok", "ambiguous"), result.reason
+        if result.status == "ok":
+            error = error_of(result.candidates[0].T_slice_model, world)
+            squares.append(error @ np.linalg.inv(result.candidates[0].covariance) @ error)
+    assert len(squares) > 30
+    assert np.mean(squares) < 6 * 1.35, np.mean(squares)  # 3 sd of a mean of forty
+    assert np.max(squares) < 40
+
+
+def test_mount_is_taken_in_patient_axes() -> None:
+    rng = np.random.default_rng(813)
+    model = load_rod_model("leksell-g-3-panel")
+    assert model.mount is not None
+    R_patient_slice = poses.exp_rotation(np.array([0.05, -0.1, 1.2]))  # a patient on the side
+    R = R_patient_slice.T @ poses.exp_rotation(rng.normal(size=3) * 0.05) @ model.mount.patient_from_model
+    normal = R[2]
+    t = np.array([150.0, 140.0, 0.0]) - R @ (model.centre + 3 * normal)
+    rods, uv = [], []
+    for i, (a, b) in enumerate(zip(model.starts, model.ends, strict=True)):
+        p, q = R @ a + t, R @ b + t
+        if (p[2] > 0) != (q[2] > 0):
+            rods.append(i)
+            uv.append((p + p[2] / (p[2] - q[2]) * (q - p))[:2] / 0.6)
+    assert len(rods) >= 5
+    T_patient_slice = poses.make_pose(R_patient_slice, np.zeros(3))
+    spots, scale = Spots.from_points(np.array(uv), 0.05), Scale(s_x=0.6, s_y=0.6)
+    in_patient = register(spots, model, scale=scale, T_patient_slice=T_patient_slice)
+    assert in_patient.status in ("ok", "ambiguous")
+    # taken in slice axes instead, the same mount excludes the pose
+    assert poses.rotation_angle(R @ np.asarray(model.mount.patient_from_model).T) > np.radians(45)
+    without = register(spots, model, scale=scale)
+    assert without.best is None or poses.rotation_angle(without.best.T_slice_model[:3, :3] @ R.T) > np.radians(10)
+
+
+def test_a_rod_model_of_parallel_rods_gives_no_pose() -> None:
+    rng = np.random.default_rng(814)
+    frame = random_frame(rng, 7)
+    upright = OracleFrame(frame.starts, frame.starts + np.array([0, 0, 40.0]))
+    uv = upright.starts[:, :2] / 0.5 + 200
+    assert register(Spots.from_points(uv, 0.05), model_of(upright), scale=Scale(s_x=0.5, s_y=0.5)).status != "ok"
+
+
+def test_bound_of_the_oracle_is_the_covariance_of_the_package() -> None:
+    rng = np.random.default_rng(815)
+    world = some_scene(rng, frame_of(CUBE), sd_px=0.001, least=8)
+    best = registered(world, CUBE).candidates[0]
+    expected = bound(frame_of(CUBE), sorted(best.rod_index.tolist()), world.R, world.t, world.mm_per_px, 0.001)
+    np.testing.assert_allclose(best.covariance, expected, rtol=0.01, atol=1e-12)
