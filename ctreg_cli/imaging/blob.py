@@ -11,8 +11,8 @@ from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, 
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
 BACKGROUND_QUANTILE = 0.75
-#: heights at which a blob is searched for a valley through it; how deep it must be, in spreads of the blob's ring
-SPLIT_LEVELS, SPLIT_DEPTH = (0.65, 0.85), 6.0
+#: heights at which a blob is searched for a valley through it; how deep it must be, in spreads of its ring
+SPLIT_LEVELS, SPLIT_DEPTH = (0.65, 0.85), 12.0
 #: width of the background that must be seen between a blob and the edge of its window, px
 BACKGROUND_PX = 4.0
 #: a window is moved to its blob's centre at most so often; once is nearly always enough

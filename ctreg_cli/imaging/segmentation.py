@@ -48,7 +48,7 @@ class SegmentationOptions:
 DEFAULT_OPTIONS = SegmentationOptions()
 
 #: radii of the windows tried, px, until a spot fits with background about it
-WINDOW_RADII_PX = (7, 11, 17, 26)
+WINDOW_RADII_PX = (8, 12, 18, 26)
 #: without a known rod diameter a spot is at most so thick: in mm, or where there is no scale as a share of the image
 MAX_WIDTH_MM, MAX_WIDTH_OF_IMAGE, LEAST_MAX_WIDTH_PX = 6.0, 0.02, 8.0
 #: blur and clipping make a spot look wider than its rod: by this factor and this many pixels

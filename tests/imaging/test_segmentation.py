@@ -156,7 +156,7 @@ def test_a_faint_rod_beside_bright_ones_stays(image: np.ndarray) -> None:
     [
         (lambda row, column: 2000.0 * (np.hypot(row - 64, column - 80) < 10), "too_large"),
         (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 60)), "too_large"),
-        (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 19)), "too_elongated"),
+        (lambda row, column: 2000.0 * ((np.abs(row - 64) < 2) & (np.abs(column - 80) < 14)), "too_elongated"),
         (lambda row, column: render_rod(SHAPE, (1.3, 64.0)), "at_border"),
     ],
 )
