@@ -98,9 +98,12 @@ def measure_blobs(image: UprightImage, peaks: IntArray, radius: int) -> Blobs:
     So whoever comes with another peak of the same blob gets the same window, and the same centre from it.
     """
     blobs = _measure(image, peaks, radius)
-    for _ in range(RECENTRINGS):
+    for attempt in range(RECENTRINGS):
         middles = np.rint(blobs.uv_px).astype(np.intp)
-        moved = np.flatnonzero((middles != blobs.middles).any(axis=1) & ~blobs.cut_off)
+        moved = (middles != blobs.middles).any(axis=1)
+        if attempt:  # a long blob may fit once its middle is found; what still does not is given up here
+            moved &= ~blobs.cut_off
+        moved = np.flatnonzero(moved)
         if not len(moved):
             break
         blobs = blobs.replaced(moved, _measure(image, middles[moved], radius))

@@ -143,6 +143,16 @@ def test_a_long_tilted_spot_in_a_thick_slab_is_one_spot() -> None:
     assert np.tan(spots.angle_rad[0]) == pytest.approx(1 / 3, abs=0.05)
 
 
+def test_any_peak_of_a_long_spot_leads_to_the_same_centre() -> None:
+    rod = {"thickness_mm": 8.0, "slope": (0.9, 0.3), "contrast": 9000.0}
+    values = render_rod((96, 96), (48.3, 47.6), **rod) + np.random.default_rng(1).normal(0, 20, (96, 96))
+    slice_ = as_slice(values, thickness_mm=8.0)
+    expected = find_spots(slice_).uv_px
+    for along in (-5.0, -2.0, 2.0, 5.0):
+        measured = measure_spots(slice_, expected + along * np.array([[0.9, 0.3]]), 6.0)
+        np.testing.assert_allclose(measured.uv_px, expected, atol=1e-3)
+
+
 def test_a_faint_rod_beside_bright_ones_stays(image: np.ndarray) -> None:
     faint = image + render_rod(SHAPE, (60.0, 20.0), contrast=1200.0)
     assert np.linalg.norm(find_spots(as_slice(faint)).uv_px - [60.0, 20.0], axis=1).min() < 0.2
