@@ -26,13 +26,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry.pose import rotation_angle
 from ctreg_cli.registration.refine import Linearisation, covariance_from_information
 from ctreg_cli.rods import RodModel
 
 #: probability that a rod the slice cuts leaves a spot the segmentation finds
 P_SEEN = 0.8
+#: clutter fainter than this share of the faintest matched spot is not mistaken for a rod: rods are of one metal
+_FAINTER = 0.75
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their centre
 _NEIGHBOURHOOD = 1.25
 
@@ -97,6 +99,8 @@ def log_odds(
     matched: BoolArray,
     expected: BoolArray,
     *,
+    brightness: FloatArray | None = None,
+    spot_of_rod: IntArray | None = None,
     log_prior_density: FloatArray | None = None,
 ) -> FloatArray:
     """ln E (b,) of ``b`` refined hypotheses, in slice millimetres.
@@ -109,6 +113,9 @@ def log_odds(
         fit: their linearisation, in millimetres.
         matched: (b, n) rods with a spot.
         expected: (b, n) rods that would have to be seen, matched or not.
+        brightness: (m,) contrast of every spot, where it was measured, with
+        spot_of_rod: (b, n) the spot of each rod: clutter much fainter than any matched spot could not have been taken for it,
+            and does not count.
         log_prior_density: (b,) ln π(θ) where a prediction says more than ``prior`` (tracking), per mm³ rad³.
     """
     crossing = fit.predicted_px
@@ -120,6 +127,9 @@ def log_odds(
     reach = np.where(usable, np.linalg.norm(crossing - centre[:, None], axis=-1), 0).max(axis=1)
     reach = _NEIGHBOURHOOD * np.maximum(reach, 1e-3 * model.size_mm)
     near = np.linalg.norm(spots_mm[None] - centre[:, None], axis=-1) <= reach[:, None]
+    if brightness is not None and spot_of_rod is not None:
+        faintest = np.where(matched, brightness[spot_of_rod], np.inf).min(axis=1)
+        near &= brightness >= _FAINTER * faintest[:, None]
     n = matched.sum(axis=1)
     m = np.maximum(near.sum(axis=1), n)
     area = math.pi * reach**2

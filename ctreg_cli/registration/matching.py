@@ -63,6 +63,8 @@ class Scene:
     xy_mm: FloatArray
     covariance_mm: FloatArray
     prior: PosePrior
+    #: (m,) contrast, where the spots have one
+    brightness: FloatArray | None = None
     #: how far beyond its ends a rod may still leave a spot, mm per unit of slope: half the slab
     half_slab_mm: float = 0.0
     #: (2, 2) lower and upper corner of the image, mm; None: unbounded
@@ -74,6 +76,7 @@ class Scene:
             xy_mm=self.xy_mm[spots],
             covariance_mm=self.covariance_mm[spots],
             prior=self.prior,
+            brightness=None if self.brightness is None else self.brightness[spots],
             half_slab_mm=self.half_slab_mm,
             field_mm=self.field_mm,
         )
@@ -410,7 +413,9 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
     may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     matched = spot_of_rod >= 0
     must &= ~_merged(model, scene, fit.predicted_px, matched, must)
-    odds = log_odds(model, scene.prior, scene.xy_mm, T, fit, matched, must)
+    odds = log_odds(
+        model, scene.prior, scene.xy_mm, T, fit, matched, must, brightness=scene.brightness, spot_of_rod=spot_of_rod
+    )
     good = (
         np.isfinite(odds)
         & scene.prior.allows(T[:, :3, :3])

@@ -81,6 +81,7 @@ def make_scene(
         xy_mm=spots.uv_px * s,
         covariance_mm=spots.covariance_px * (s[:, None] * s),
         prior=pose_prior(model, T_patient_slice, options),
+        brightness=spots.contrast if len(spots) and np.isfinite(spots.contrast).all() else None,
         half_slab_mm=0.5 * thickness_mm if thickness_mm is not None else 0.0,
         field_mm=field,
     )
