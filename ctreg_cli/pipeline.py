@@ -169,12 +169,13 @@ def track_slice(
         if override is not None and prediction is not None:
             where = prediction.visible & _inside(prediction.spots_px, slice_.info.shape)
             spots = measure_spots(slice_, prediction.spots_px[where], prediction.radius_px[where], segmentation)
-            tracked = tracker.follows(spots, slice_.info, override)
+            tracked = tracker.follow(spots, slice_.info, override)
             if tracked is not None:
                 item = SpotSlice(info=slice_.info, spots=spots)
                 return _tracked_result(place, item, tracker, tracked)
     item = spots_of(slice_, segmentation)
     if item.problem:
+        tracker.miss()
         return failure(place if item.index is None else item.index, item, "unreadable")
     tracked = tracker.step(item.spots, item.info, scale_of(item, scale))
     return _tracked_result(place, item, tracker, tracked)

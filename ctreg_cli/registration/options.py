@@ -26,3 +26,5 @@ class TrackingOptions:
     jacobian: Literal["updated", "constant"] = "updated"
     #: share of the spot error taken back in one servo step, 0 < gain ≤ 1
     gain: float = 1.0
+    #: where the frame is expected in the next slice: carried on by its velocity, or where it was
+    prediction: Literal["velocity", "identity"] = "velocity"

@@ -1,10 +1,12 @@
 """The control law: image-based visual servoing of a virtual frame (Doignon et al. 2008, eq. 16 and 17).
 
-``ξ = −g Ĵ⁺ (s − s*)``: s are the spots predicted from the current pose, s* the spots measured; the pose follows the twist,
-``R ← exp([Ω]ₓ) R``, ``t ← t + V``, until the step is small. Ĵ⁺ is either recomputed at every step (*updated*: Gauss–Newton
-with a gain; straight spot paths) or kept from the last full registration (*constant*: no new Jacobian; curved paths).
-Stable while the symmetric part of ``Ĵ⁺ J`` is positive definite; its smallest eigenvalue is the margin, and means something
-only with the rotation columns brought to millimetres by the frame's size.
+``ξ = −g Ĵ⁺ (s − s*)``: s are the spots predicted from the current pose, s* the spots measured; the pose follows the
+twist, ``R ← exp([Ω]ₓ) R``, ``t ← t + V``, until the step is small. Ĵ is either recomputed at every step (*updated*:
+Gauss–Newton with a gain; straight spot paths) or kept from the desired features of the last registration (*constant*;
+curved paths). Stable while the symmetric part of ``Ĵ⁺ J`` is positive definite (eq. 17); its smallest eigenvalue is the
+margin, and means something only with the rotation columns brought to millimetres by the frame's size.
+
+One pose at a time and the seen rods only, in closed forms: this is what a tracked slice costs.
 """
 
 from __future__ import annotations
@@ -13,13 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.registration.refine import Linearisation, Observations, linearise
+from ctreg_cli.geometry.motion_field import motion_field
+from ctreg_cli.geometry.projection import project
+from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.rods import RodModel
 
-#: the margin below which a constant Jacobian is not trusted any more
-LEAST_MARGIN = 0.05
+#: a step never turns the frame by more than this, rad
+_MAX_TURN_RAD = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,10 +33,95 @@ class ServoOptions:
     #: share of the spot error taken back in one step, 0 < gain ≤ 1
     gain: float = 1.0
     #: stop when a step moves the pose by less than this share of the frame's size (and as many rad) ...
-    step_tolerance: float = 1e-7
-    #: ... or when the spots are this close to the measured ones (rms, px)
-    residual_tolerance_px: float = 1e-9
-    max_iterations: int = 200
+    step_tolerance: float = 1e-9
+    #: ... or the spots by less than this altogether, in standard deviations of theirs ...
+    spot_tolerance_sd: float = 1e-3
+    #: ... or when the spots are this close to the measured ones (rms, in their unit)
+    residual_tolerance: float = 1e-9
+    max_iterations: int = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Desired:
+    """The desired features s*: ``k`` measured spots and the rods they belong to."""
+
+    #: (k, 3) starts and unit directions of the rods, model frame, mm, and (k,) their tolerances
+    starts: FloatArray
+    directions: FloatArray
+    tolerances: FloatArray
+    #: (k, 2) spots and (k, 2, 2) their covariances, px
+    uv_px: FloatArray
+    covariance_px: FloatArray
+    #: (2,) ``[s_x, s_y]``; ones where the spots are given in millimetres
+    mm_per_px: FloatArray
+
+    @classmethod
+    def of(
+        cls, model: RodModel, rods: IntArray, uv_px: FloatArray, covariance_px: FloatArray, mm_per_px: FloatArray
+    ) -> Desired:
+        """The spots ``uv_px`` (k, 2) of the rods with the indices ``rods`` (k,)."""
+        return cls(
+            starts=model.starts[rods],
+            directions=model.directions[rods],
+            tolerances=model.tolerances[rods],
+            uv_px=uv_px,
+            covariance_px=covariance_px,
+            mm_per_px=mm_per_px,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """The desired features seen from a pose."""
+
+    #: (k, 2) spots of this pose, and measured minus these, px
+    spots_px: FloatArray
+    residual_px: FloatArray
+    #: (k, 2, 2) covariance of a residual (spot noise and the frame's tolerance) and its inverse
+    covariance_px: FloatArray
+    weight: FloatArray
+    #: (2k, 6) motion field, px per mm and rad
+    jacobian: FloatArray
+    #: (k,) where the slice cuts each rod, mm
+    lambda_mm: FloatArray
+
+    @property
+    def chi2(self) -> float:
+        """Σ rᵀ W r."""
+        r = self.residual_px
+        return float((r[:, None] @ self.weight @ r[:, :, None]).sum())
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the residuals over both coordinates."""
+        return float(np.sqrt(np.mean(self.residual_px**2)))
+
+    def weighted(self, jacobian: FloatArray) -> FloatArray:
+        """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
+        product: FloatArray = (self.weight @ jacobian.reshape(-1, 2, 6)).reshape(-1, 6)
+        return product
+
+
+def view(desired: Desired, T: FloatArray) -> View:
+    """The desired features from the pose ``T`` (4, 4); not finite where one of the rods lies in the slice."""
+    projection = project(T, desired.starts, desired.directions)
+    spots = projection.xy_mm / desired.mm_per_px
+    k = projection.slope
+    tolerance = k[:, :, None] * k[:, None, :]
+    tolerance[:, 0, 0] += 1.0
+    tolerance[:, 1, 1] += 1.0
+    tolerance *= (desired.tolerances**2)[:, None, None] / (desired.mm_per_px[:, None] * desired.mm_per_px)
+    covariance = desired.covariance_px + tolerance
+    J = motion_field(T, projection)
+    J /= desired.mm_per_px[:, None]
+    return View(
+        spots_px=spots,
+        residual_px=desired.uv_px - spots,
+        covariance_px=covariance,
+        weight=invert_2x2(covariance),
+        jacobian=J.reshape(-1, 6),
+        lambda_mm=projection.lambda_mm,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,98 +129,104 @@ class ServoResult:
     """Where the servo ended, and the way there."""
 
     T: FloatArray
-    linearisation: Linearisation
+    view: View
+    #: (6, 6) of the pose error ``[V; Ω]``, mm and rad: the Cramér–Rao bound for *updated*, a little more for *constant*
+    covariance: FloatArray
     iterations: int
     converged: bool
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J at the end
     margin: float
-    #: (i + 1, 4, 4) poses from start to end, and (i + 1, n, 2) their spots, px; only when asked for
-    path_T: FloatArray
-    path_px: FloatArray
+    #: (i + 1, 4, 4) poses from start to end, and (i + 1, k, 2) their spots, px; only when asked for
+    path_T: FloatArray | None = None
+    path_px: FloatArray | None = None
 
 
-def weighted_pseudoinverse(fit: Linearisation) -> FloatArray:
-    """``Ĵ⁺ = (Jᵀ W J)⁻¹ Jᵀ W`` (6, 2n) of a one-hypothesis linearisation; zero columns where nothing was matched.
+def pseudoinverse(jacobian: FloatArray, here: View) -> FloatArray:
+    """``Ĵ⁺ = (Ĵᵀ W Ĵ)⁻¹ Ĵᵀ W`` (6, 2k) with the weights of ``here``.
 
     Raises:
         numpy.linalg.LinAlgError: the spots do not determine the pose.
     """
-    H, _ = fit.normal_equations()
-    n = fit.residual_px.shape[1]
-    JtW = np.swapaxes((fit.weight @ fit.jacobian).reshape(2 * n, 6), 0, 1)
-    result: FloatArray = np.linalg.solve(H[0], JtW)
-    return result
+    WJ = here.weighted(jacobian)
+    return np.asarray(np.linalg.solve(WJ.T @ jacobian, WJ.T))
 
 
-def stability_margin(J_plus: FloatArray, jacobian: FloatArray, matched: BoolArray, size_mm: float) -> float:
+def stability_margin(J_plus: FloatArray, jacobian: FloatArray, size_mm: float) -> float:
     """Smallest eigenvalue of the symmetric part of ``Ĵ⁺ J`` (eq. 17), rotation measured in frame sizes.
 
     Args:
-        J_plus: (6, 2n) the pseudo-inverse in use.
-        jacobian: (n, 2, 6) the true Jacobian now, px per mm and rad.
-        matched: (n,) rods with a spot now.
+        J_plus: (6, 2k) the pseudo-inverse in use.
+        jacobian: (2k, 6) the true Jacobian, px per mm and rad.
         size_mm: the frame's size.
     """
-    unit = np.array([1, 1, 1, *(3 * [size_mm])])
-    J = np.where(matched[:, None, None], jacobian, 0.0).reshape(-1, 6)
-    M = (J_plus @ J) * unit[:, None] / unit
+    unit = _unit(size_mm)
+    M = (J_plus @ jacobian) * unit[:, None] / unit
     return float(np.linalg.eigvalsh(0.5 * (M + M.T))[0])
 
 
 def servo(
     model: RodModel,
     T: FloatArray,
-    measured: Observations,
+    desired: Desired,
     *,
     options: ServoOptions | None = None,
-    J_plus: FloatArray | None = None,
+    jacobian: FloatArray | None = None,
     keep_path: bool = False,
 ) -> ServoResult:
     """Move the pose until its spots are the measured ones.
 
     Args:
-        model: the rods.
+        model: the frame; its size brings rotation to millimetres.
         T: (4, 4) start.
-        measured: one hypothesis: the spot of each rod, px.
+        desired: s*.
         options: see :class:`ServoOptions`.
-        J_plus: (6, 2n) a constant Ĵ⁺; None: recomputed at every step (*updated*).
+        jacobian: (2k, 6) Ĵ of the *constant* strategy; None: recomputed at every step (*updated*).
         keep_path: also return every pose and spot on the way.
 
     Raises:
-        numpy.linalg.LinAlgError: *updated*, and the spots do not determine the pose.
+        numpy.linalg.LinAlgError: the spots do not determine the pose, or a rod came to lie in the slice on the way.
     """
     options = options or ServoOptions()
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
-    here = linearise(model, T[None], measured)
-    path_T, path_px = [T], [here.predicted_px[0]]
+    unit = _unit(model.size_mm)
+    here = view(desired, T)
+    J_plus = pseudoinverse(here.jacobian if jacobian is None else jacobian, here)
+    path = [(T, here.spots_px)]
     converged, iterations = False, 0
-    gain_matrix = J_plus
-    while iterations < options.max_iterations:
-        if J_plus is None:
-            gain_matrix = weighted_pseudoinverse(here)
-        assert gain_matrix is not None
-        step = options.gain * gain_matrix @ here.residual_px[0].reshape(-1)  # residual is s* − s
+    while not converged and iterations < options.max_iterations:
+        step = options.gain * (J_plus @ here.residual_px.reshape(-1))  # the residual is s* − s
+        step *= min(1.0, _MAX_TURN_RAD / max(float(np.sqrt(step[3:] @ step[3:])), _MAX_TURN_RAD))
         iterations += 1
         T = poses.update(T, step)
-        here = linearise(model, T[None], measured)
+        last, here = here, view(desired, T)
         if keep_path:
-            path_T.append(T)
-            path_px.append(here.predicted_px[0])
-        if not np.isfinite(T).all() or not np.isfinite(here.chi2[0]):
-            break
-        small = float(np.abs(step * unit).max()) <= options.step_tolerance * model.size_mm
-        exact = float(np.sqrt((here.residual_px**2).mean())) <= options.residual_tolerance_px
-        if small or exact:
-            converged = True
-            break
-    used = gain_matrix if J_plus is not None else weighted_pseudoinverse(here)
-    assert used is not None
+            path.append((T, here.spots_px))
+        if not np.isfinite(here.residual_px).all():
+            raise np.linalg.LinAlgError("a rod came to lie in the slice")
+        if jacobian is None:
+            J_plus = pseudoinverse(here.jacobian, here)
+        moved = float(np.abs(step * unit).max()) / model.size_mm
+        d = here.spots_px - last.spots_px
+        moved_sd2 = float((d[:, None] @ here.weight @ d[:, :, None]).sum())
+        converged = (
+            moved <= options.step_tolerance * options.gain
+            or moved_sd2 <= (options.spot_tolerance_sd * options.gain) ** 2
+            or here.rms_px <= options.residual_tolerance
+        )
+    influence = J_plus
+    if jacobian is not None:  # noise moves the pose where Ĵᵀ W r = 0 by (Ĵ⁺ J)⁻¹ Ĵ⁺
+        influence = np.asarray(np.linalg.solve(J_plus @ here.jacobian, J_plus))
+    covariance = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
     return ServoResult(
         T=T,
-        linearisation=here,
+        view=here,
+        covariance=covariance.reshape(6, -1) @ influence.T,
         iterations=iterations,
         converged=converged,
-        margin=stability_margin(used, here.jacobian[0], measured.matched[0], model.size_mm),
-        path_T=np.stack(path_T),
-        path_px=np.stack(path_px),
+        margin=stability_margin(J_plus, here.jacobian, model.size_mm) if converged else -np.inf,
+        path_T=np.stack([p for p, _ in path]) if keep_path else None,
+        path_px=np.stack([s for _, s in path]) if keep_path else None,
     )
+
+
+def _unit(size_mm: float) -> FloatArray:
+    return np.array([1.0, 1.0, 1.0, size_mm, size_mm, size_mm])

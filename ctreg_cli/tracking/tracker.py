@@ -1,51 +1,61 @@
-"""The frame from slice to slice: predict, gate, assign, servo, verify, lose, re-register.
+"""The frame from slice to slice: predict, gate, assign, servo, verify, doubt, lose, register anew.
 
-A tracked pose is believed for the same reasons as a registered one, and one more: it lies where the past said it would.
-What fails a check is not forced: the slice is registered anew from all its spots, and if that fails too the frame is lost,
-and said to be. A symmetric frame's second pose is excluded by the past only while the past is certain.
+Three ways lead to a pose, each taken only when the one before does not settle the slice:
+
+1. *Servo*: spots in the predicted gates, one to one; the control law brings the frame there. Believed at once only if
+   nothing is in doubt (:mod:`~ctreg_cli.tracking.verify`).
+2. *Doubt*: the same matches taken apart as a registration's are: other minima, exchanged and dropped spots.
+3. *Register*: all spots, without labels.
+
+In 2 and 3 the past enters as what it is, a prior on the pose (:mod:`~ctreg_cli.tracking.prior`): a symmetric frame's
+second pose is excluded by the past only while the past is certain. The pose itself never leans on the past.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
 
-from ctreg_cli.arrays import FloatArray, IntArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.evidence import PosePrior, log_odds
-from ctreg_cli.registration.matching import Scene, assign, nearest_assignment, observations, visibility
+from ctreg_cli.registration.matching import Scene, doubt, join, nearest_assignment, search, weigh
 from ctreg_cli.registration.options import TrackingOptions
-from ctreg_cli.registration.refine import covariance_from_information, linearise
-from ctreg_cli.registration.register import (
-    BAD_FIT_P,
-    accepted_log_odds,
-    assemble_candidate,
-    fit_warnings,
-    make_scene,
-    register,
-)
+from ctreg_cli.registration.register import LEAST_MATCHES, decide, make_scene
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from ctreg_cli.tracking.servo import LEAST_MARGIN, ServoOptions, servo, weighted_pseudoinverse
+from ctreg_cli.tracking import motion
+from ctreg_cli.tracking.prior import PastPrior
+from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, verified
 
-#: a new pose farther from the prediction than this (χ² of six degrees of freedom) is not a continuation
-_INNOVATION2 = 35.0
-#: motion between two slices before any has been seen: standard deviations, mm and rad
-_FIRST_STEP = (3.0, math.radians(3.0))
-#: motion never taken to be steadier than this from slice to slice, mm and rad
-_LEAST_STEP = (0.3, math.radians(0.3))
-#: weight of the newest innovation in the running estimate of how the frame moves
-_ADAPT = 0.25
-#: matches below which a tracked pose is registered anew
-_LEAST_MATCHES = 5
+#: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
+CONTINUES_D2 = 35.0
+#: gates about predicted spots, in sd
+GATE_SD = 4.5
+#: the margin below which a constant Jacobian is not trusted any more, and the most it may cost in variance
+LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
+#: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
+_ASSIGNMENTS = 3
+#: the servo is done when all spots together move by less than this (sd); so many steps of gain 1 are enough for right labels
+_DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
+#: so many spots where the past expects them speak for it even when they do not make a pose
+_MATCHES_THAT_AGREE = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Velocity:
+    """How fast the frame moves, the table's own motion taken out; slice axes."""
+
+    #: (6,) ``[V; Ω]`` of the model origin, mm/s and rad/s, and its (6, 6) covariance
+    twist: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,289 +66,385 @@ class Tracked:
     #: ``registered`` | ``updated`` | ``constant`` | ``reacquired``; empty without a pose
     method: str
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J, scaled; None without a pose
-    stability: float | None
+    stability: float | None = None
+    #: None without a pose, without times, and in the first slice
+    velocity: Velocity | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prediction:
     """Where the frame should be in the next slice."""
 
+    #: (4, 4), and the (6, 6) covariance of the twist from it to the truth
     T: FloatArray
-    #: (6, 6) of the twist from the prediction to the truth
     covariance: FloatArray
     #: (n, 2) px, and whether each rod may be seen
     spots_px: FloatArray
-    visible: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    visible: BoolArray
     #: (n,) radius within which each spot should lie, px
     radius_px: FloatArray
+    #: the same as a motion, and the time it bridges: s, and slices
+    motion: motion.MotionState
+    dt_s: float
+    n_slices: int
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Past:
-    """All the tracker remembers."""
+    """The last slice with a sure pose."""
 
-    T: FloatArray
-    covariance: FloatArray
+    motion: motion.MotionState
     info: SliceInfo
-    #: (6,) motion from slice to slice (or a second), and its spread: mean square innovation, mm² and rad²
-    velocity: FloatArray = field(default_factory=lambda: np.zeros(6))
-    spread: FloatArray = field(default_factory=lambda: np.repeat(np.square(np.array(_FIRST_STEP, dtype=np.float64)), 3))
-    steps: int = 0
+    spots_px: FloatArray
+    tracked: Tracked
+    #: slices since, in which the frame was not found
+    n_missed: int = 0
 
 
 class Tracker:
     """Follow one frame through slices in the order of time.
 
-    ``predict`` says where to look in the next slice (so that only windows need be segmented); ``step`` takes the spots found
-    and gives the verdict. Not thread-safe; one tracker a sequence.
+    ``predict`` says where to look in the next slice (so that only windows need be segmented); ``follow`` gives the
+    verdict on spots from such windows, if it can; ``step`` the verdict on all spots of a slice; ``miss`` passes a slice
+    by. One tracker a sequence; not thread-safe.
     """
 
     def __init__(self, model: RodModel, options: TrackingOptions | None = None) -> None:
         self.model = model
         self.options = options or TrackingOptions()
         self._past: _Past | None = None
-        self._J_plus: FloatArray | None = None
-        self._registered_rods: IntArray | None = None
-        self._was_lost = False
+        self._predicted: tuple[SliceInfo, Prediction | None] | None = None
+        #: (n, 2, 6) Ĵ of the constant strategy, mm per mm and rad
+        self._kept_jacobian: FloatArray | None = None
+        self._is_lost = False
+        gain = self.options.gain
+        self._servo_options = ServoOptions(
+            gain=gain, spot_tolerance_sd=_DONE_SD, max_iterations=math.ceil(_MAX_FULL_STEPS / gain)
+        )
+
+    # --- where it should be ------------------------------------------------------------------------------------------
 
     def predict(self, info: SliceInfo, scale: Scale) -> Prediction | None:
         """The pose and spots expected in the next slice; None while there is no past to go by."""
-        past = self._past
+        if self._predicted is None or self._predicted[0] is not info:
+            self._predicted = (info, self._predict(info, scale))
+        return self._predicted[1]
+
+    def _predict(self, info: SliceInfo, scale: Scale) -> Prediction | None:
+        past, model = self._past, self.model
         if past is None or past.info.series != info.series:
             return None
-        T, covariance = self._predicted_pose(past, info)
-        projection = project(T, self.model.starts, self.model.directions)
+        if (past.info.T_patient_slice is None) != (info.T_patient_slice is None):
+            return None
+        n_slices = past.n_missed + 1
+        dt_s = float(n_slices)
+        if info.time_s is not None and past.info.time_s is not None:
+            dt_s = info.time_s - past.info.time_s
+            if dt_s < 0:
+                return None
+        moved = motion.advance(past.motion, dt_s, self.options.prediction)
+        T = _from_still_axes(moved.T, info)
+        lever = -T[:3, :3] @ model.centre
+        T = _shifted(T, lever)
+        G = motion.about_middle(lever)
+        covariance = G @ _rotated(moved.pose_covariance, info, back=True) @ G.T
+        projection = project(T, model.starts, model.directions)
         J = np.nan_to_num(motion_field(T, projection))
+        reach = np.sqrt((J @ covariance * J).sum(axis=-1).max(axis=-1))
+        # how far along a rod that moves the slice
+        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * np.sqrt(1 + (projection.slope**2).sum(axis=-1))
+        visible = (projection.lambda_mm >= -slack) & (projection.lambda_mm <= model.lengths + slack)
         s = scale.mm_per_px
-        variance = np.einsum("nij,jk,nik->ni", J, covariance, J).max(axis=1)
-        slack = 0.5 * (info.thickness_mm or 0.0)
-        reach = np.sqrt(variance)
-        visible = (
-            np.isfinite(projection.lambda_mm)
-            & (projection.lambda_mm >= -slack - 3 * reach)
-            & (projection.lambda_mm <= self.model.lengths + slack + 3 * reach)
-        )
         return Prediction(
             T=T,
             covariance=covariance,
             spots_px=projection.xy_mm / s,
             visible=visible,
-            radius_px=4 * reach / float(s.min()),
+            radius_px=GATE_SD * reach / float(s.min()),
+            motion=moved,
+            dt_s=dt_s,
+            n_slices=n_slices,
         )
 
-    def _predicted_pose(self, past: _Past, info: SliceInfo) -> tuple[FloatArray, FloatArray]:
-        """Constant velocity from the last pose; a table that moved in between is taken out by the patient geometry."""
-        T = past.T
-        here, there = past.info.T_patient_slice, info.T_patient_slice
-        if here is not None and there is not None:
-            T = poses.inverse(there) @ here @ T
-        T = poses.update(T, past.velocity)
-        covariance = past.covariance + np.diag(past.spread)
-        return T, covariance
+    # --- the verdict on a slice --------------------------------------------------------------------------------------
 
     def step(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked:
         """The verdict on the next slice.
 
         Args:
-            spots: its spots, px.
+            spots: all its spots, px.
             info: what is known of the slice.
             scale: mm per pixel.
         """
         prediction = self.predict(info, scale)
         if prediction is None:
-            self._was_lost = self._past is not None or self._was_lost
             self._past = None
-        else:
-            tracked = self._follow(prediction, spots, info, scale)
-            if tracked is not None:
-                return self._remember(tracked, prediction, info)
-        return self.register(spots, info, scale)
+        elif (again := self._repeated(spots, prediction, info)) is not None:
+            return again
+        scene = self._scene(spots, info, scale)
+        why = ""
+        followed = None
+        if prediction is not None:
+            followed, why = self._servoed(prediction, scene)
+        if prediction is not None and followed is not None:
+            sure = None
+            if not why:
+                sure = self._verified(prediction, scene, spots, scale, followed) or self._doubted(
+                    prediction, scene, spots, scale, followed
+                )
+            if sure is not None:
+                return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info)
+        return self._registered(prediction, scene, spots, info, scale, followed, why)
 
-    def follows(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
-        """Like :meth:`step`, but None (and nothing remembered) instead of registering anew."""
+    def follow(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
+        """The verdict on the next slice from spots about the predicted ones, if nothing is in doubt; else None.
+
+        None leaves the tracker as it was: give ``step`` all spots of the slice.
+        """
         prediction = self.predict(info, scale)
         if prediction is None:
             return None
-        tracked = self._follow(prediction, spots, info, scale)
-        return None if tracked is None else self._remember(tracked, prediction, info)
+        scene = self._scene(spots, info, scale)
+        followed, why = self._servoed(prediction, scene)
+        if followed is None or why:
+            return None
+        sure = self._verified(prediction, scene, spots, scale, followed)
+        if sure is None:
+            return None
+        return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info)
 
-    def register(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked:
-        """Register a slice from all its spots, without labels; the past only settles what is ambiguous."""
-        prediction = self.predict(info, scale)
-        registration = register(
+    def miss(self) -> None:
+        """A slice that could not be read: time passes."""
+        self._is_lost = self._is_lost or self._past is not None
+        if self._past is not None:
+            self._past = replace(self._past, n_missed=self._past.n_missed + 1)
+
+    def _scene(self, spots: Spots, info: SliceInfo, scale: Scale) -> Scene:
+        return make_scene(
             spots,
             self.model,
-            scale=scale,
+            scale,
             T_patient_slice=info.T_patient_slice,
             thickness_mm=info.thickness_mm,
             shape=info.shape,
             options=self.options.registration,
         )
-        if registration.status == "ambiguous" and prediction is not None and registration.reason == "rival_pose":
-            registration = _settled_by_past(registration, prediction)
-        if registration.status != "ok":
-            self._was_lost = self._was_lost or self._past is not None
-            self._past = None
-            return Tracked(
-                registration=registration, method="registered" if registration.candidates else "", stability=None
-            )
-        best = registration.candidates[0]
-        method = "reacquired" if self._was_lost or self._past is not None else "registered"
-        self._was_lost = False
-        self._keep_jacobian(best, spots, scale)
-        margin = 1.0  # Ĵ is J here
-        return self._remember(Tracked(registration=registration, method=method, stability=margin), prediction, info)
 
-    def _keep_jacobian(self, best: Candidate, spots: Spots, scale: Scale) -> None:
-        """Ĵ⁺ at the desired features of this registration, for the constant strategy."""
-        seen = observations(_spot_scene(spots, scale), _spot_of_rod(self.model, best))
-        self._J_plus = weighted_pseudoinverse(linearise(self.model, best.T_slice_model[None], seen))
-        self._registered_rods = best.rod_index
-
-    def _follow(self, prediction: Prediction, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
-        """Predict, gate, assign, servo, verify; None when a check fails."""
-        model, options = self.model, self.options
-        if len(spots) < _LEAST_MATCHES:
+    def _repeated(self, spots: Spots, prediction: Prediction, info: SliceInfo) -> Tracked | None:
+        """The verdict on the last slice, if this one is the same again (to the last digit): it tells nothing new."""
+        past = self._past
+        if past is None or past.n_missed or not np.array_equal(spots.uv_px, past.spots_px):
             return None
-        scene = make_scene(
-            spots,
-            model,
-            scale,
-            T_patient_slice=info.T_patient_slice,
-            thickness_mm=info.thickness_mm,
-            shape=info.shape,
-            options=options.registration,
-        )
-        spot_of_rod = nearest_assignment(model, scene, prediction.T[None], prediction.covariance)
+        here, there = past.info.T_patient_slice, info.T_patient_slice
+        if here is not None and there is not None and not np.array_equal(here, there):
+            return None
+        return past.tracked
+
+    # --- 1. servo ----------------------------------------------------------------------------------------------------
+
+    def _servoed(self, prediction: Prediction, scene: Scene) -> tuple[_Followed | None, str]:
+        """The frame brought to the spots in its gates; and why it must be registered anew, if it must."""
+        model, constant = self.model, self.options.jacobian == "constant"
+        if constant and self._kept_jacobian is None:
+            return None, "no Jacobian has been kept yet"
+        spot_of_rod = nearest_assignment(model, scene, prediction.T[None], prediction.covariance)[0]
         T = prediction.T
-        # twice: the first servo brings the pose near, so that all spots can be assigned with small gates
-        for _ in range(2):
-            if (spot_of_rod >= 0).sum() < _LEAST_MATCHES:
-                return None
-            J_plus = None
-            if options.jacobian == "constant":
-                J_plus = self._constant_for(spot_of_rod[0])
-                if J_plus is None:
-                    return None
+        for _ in range(_ASSIGNMENTS):
+            rods = np.nonzero(spot_of_rod >= 0)[0]
+            if len(rods) < CHECKABLE_MATCHES:
+                return None, f"only {len(rods)} spots lie where the past expects them"
+            spots = spot_of_rod[rods]
+            desired = Desired.of(model, rods, scene.xy_mm[spots], scene.covariance_mm[spots], np.ones(2))
+            kept = self._kept_jacobian[rods].reshape(-1, 6) if constant and self._kept_jacobian is not None else None
             try:
-                moved = servo(
-                    model,
-                    T,
-                    observations(scene, spot_of_rod),
-                    options=ServoOptions(gain=options.gain),
-                    J_plus=J_plus,
-                )
+                moved = servo(model, T, desired, options=self._servo_options, jacobian=kept)
             except np.linalg.LinAlgError:
-                return None
-            if not moved.converged or moved.margin < LEAST_MARGIN:
-                return None
-            again = assign(model, scene, moved.T[None], moved.linearisation)
-            T, same = moved.T, bool((again == spot_of_rod).all())
-            spot_of_rod = again
-            if same:
+                return None, "the spots do not determine the pose"
+            if not moved.converged:
+                return None, "the servo did not converge"
+            again = nearest_assignment(model, scene, moved.T[None], moved.covariance)[0]
+            T = moved.T
+            if np.array_equal(again, spot_of_rod):
                 break
+            spot_of_rod = again
         else:
-            return None
-        return self._verified(prediction, spots, scene, scale, T, spot_of_rod, moved.iterations, moved.margin)
-
-    def _constant_for(self, spot_of_rod: IntArray) -> FloatArray | None:
-        """The kept Ĵ⁺, if the rods seen now are those it was made for."""
-        rods = np.nonzero(spot_of_rod >= 0)[0]
-        if self._J_plus is None or self._registered_rods is None or not np.array_equal(rods, self._registered_rods):
-            return None
-        return self._J_plus
+            return None, "the matches did not settle"
+        followed = _Followed(spot_of_rod=spot_of_rod, servo=moved)
+        if constant:
+            if moved.margin < LEAST_MARGIN:
+                return followed, f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
+            best = np.linalg.inv(moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian)
+            if np.trace(np.linalg.solve(best, moved.covariance)) > 6 * MOST_VARIANCE_RATIO:
+                return followed, "the constant Jacobian has become inefficient"
+        return followed, ""
 
     def _verified(
-        self,
-        prediction: Prediction,
-        spots: Spots,
-        scene: Scene,
-        scale: Scale,
-        T: FloatArray,
-        spot_of_rod: IntArray,
-        iterations: int,
-        margin: float,
-    ) -> Tracked | None:
-        """All the checks a registered pose must pass, and that it continues the past."""
-        model = self.model
-        fit = linearise(model, T[None], observations(scene, spot_of_rod))
-        projection = project(T[None], model.starts, model.directions)
-        may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
-        matched = spot_of_rod >= 0
-        if not (may | ~matched).all() or not scene.prior.allows(T[:3, :3]):
-            return None
-        H, _ = fit.normal_equations()
-        covariance, condition = covariance_from_information(H[0], model.size_mm)
-        if not np.isfinite(condition):
-            return None
-        innovation = poses.difference(T, prediction.T)
-        total = prediction.covariance + covariance
-        distance2 = float(innovation @ np.linalg.solve(total, innovation))
-        if distance2 > _INNOVATION2:
-            return None
-        _, logdet = np.linalg.slogdet(total)
-        log_prior = np.array([-0.5 * distance2 - 3 * math.log(2 * math.pi) - 0.5 * logdet])
-        odds = log_odds(model, scene.prior, scene.xy_mm, T[None], fit, matched, must, log_prior_density=log_prior)
-        best = assemble_candidate(
-            model, spots, scale, T, fit, spot_of_rod[0], must[0], covariance, float(odds[0]), iterations
+        self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
+    ) -> Registration | None:
+        return verified(
+            self.model,
+            scene,
+            scale,
+            spots,
+            prediction.T,
+            prediction.covariance,
+            followed.servo,
+            followed.spot_of_rod,
         )
-        if (
-            best.log_odds < accepted_log_odds(len(best.rod_index))
-            or len(best.rod_index) < max(_LEAST_MATCHES, len(best.missing_rods))
-            or chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P
-        ):
-            return None
-        registration = Registration(
-            status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=fit_warnings(model, spots, best)
-        )
-        return Tracked(registration=registration, method=self.options.jacobian, stability=margin)
 
-    def _remember(self, tracked: Tracked, prediction: Prediction | None, info: SliceInfo) -> Tracked:
-        best = tracked.registration.candidates[0]
-        past = self._past
-        velocity, spread, steps = np.zeros(6), None, 0
-        if past is not None and prediction is not None:
-            innovation = poses.difference(best.T_slice_model, prediction.T)
-            moved = innovation + past.velocity
-            # a first step is not yet a velocity; then half the innovation is taken for a change of it
-            velocity = moved if past.steps == 0 else past.velocity + 0.5 * innovation
-            square = np.repeat((innovation**2).reshape(2, 3).mean(axis=1), 3)
-            blend = _ADAPT if past.steps > 1 else 0.5
-            spread = (1 - blend) * past.spread + blend * np.maximum(4 * square, np.repeat(np.square(_LEAST_STEP), 3))
-            steps = past.steps + 1
-            # a reacquired frame has jumped: what came before says nothing of how it moves now
-            if tracked.method in ("registered", "reacquired"):
-                velocity, spread, steps = np.zeros(6), None, 0
-        self._past = _Past(T=best.T_slice_model, covariance=best.covariance, info=info, velocity=velocity, steps=steps)
-        if spread is not None:
-            self._past.spread = spread
+    # --- 2. doubt ----------------------------------------------------------------------------------------------------
+
+    def _doubted(
+        self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
+    ) -> Registration | None:
+        matches = weigh(self.model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES)
+        if matches is None:
+            return None
+        matches = doubt(self.model, scene, matches, least_matches=LEAST_MATCHES)
+        matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
+        verdict = decide(self.model, scene, spots, scale, matches)
+        if verdict.status != "ok" or not continues(verdict.candidates[0], prediction):
+            return None
+        return verdict
+
+    # --- 3. register -------------------------------------------------------------------------------------------------
+
+    def _registered(
+        self,
+        prediction: Prediction | None,
+        scene: Scene,
+        spots: Spots,
+        info: SliceInfo,
+        scale: Scale,
+        followed: _Followed | None,
+        why: str,
+    ) -> Tracked:
+        """Register a slice from all its spots, without labels; the past is a prior on the pose."""
+        model = self.model
+        pool = [] if len(spots) < LEAST_MATCHES else [search(model, scene, least_matches=LEAST_MATCHES)]
+        if followed is not None:
+            pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES))
+        found = [matches for matches in pool if matches is not None]
+        if found:
+            matches = doubt(model, scene, join(found), least_matches=LEAST_MATCHES)
+            weighed = matches
+            if prediction is not None:
+                weighed = PastPrior.of(model, scene, prediction).applied(model, scene, matches)
+            verdict = decide(model, scene, spots, scale, weighed)
+            if prediction is not None and verdict.status == "no_pose":
+                # nothing where the past expects it: the past is wrong, and the slice stands on its own
+                verdict = decide(model, scene, spots, scale, matches)
+        else:
+            reason = "no_consistent_match" if pool else "too_few_spots"
+            verdict = Registration(status="no_pose", reason=reason, n_spots=len(spots))
+        if verdict.status != "ok":
+            return self._lost(verdict, prediction, scene)
+        if why:
+            verdict = replace(verdict, warnings=(*verdict.warnings, ("registered_anew", why)))
+        follows_on = prediction is not None and continues(verdict.candidates[0], prediction)
+        if self._past is not None and not follows_on:
+            self._is_lost = True
+        return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info)
+
+    def _lost(self, verdict: Registration, prediction: Prediction | None, scene: Scene) -> Tracked:
+        """No sure pose: say so; the past stays only if nothing speaks against it."""
+        if prediction is not None:
+            agrees = len(scene.xy_mm) < CHECKABLE_MATCHES
+            agrees |= any(continues(candidate, prediction) for candidate in verdict.candidates)
+            if not agrees:
+                gated = nearest_assignment(self.model, scene, prediction.T[None], prediction.covariance)[0]
+                agrees = int((gated >= 0).sum()) >= _MATCHES_THAT_AGREE
+            self._is_lost = True
+            self.miss()
+            if not agrees:
+                self._past = None
+        return Tracked(registration=verdict, method="registered" if verdict.candidates else "")
+
+    # --- memory ------------------------------------------------------------------------------------------------------
+
+    def _remember(
+        self,
+        sure: Registration,
+        method: str,
+        margin: float,
+        prediction: Prediction | None,
+        spots: Spots,
+        info: SliceInfo,
+    ) -> Tracked:
+        """Take a sure pose into the motion; ``prediction`` is None where a new motion begins."""
+        best, model = sure.candidates[0], self.model
+        lever = best.T_slice_model[:3, :3] @ model.centre
+        G = motion.about_middle(lever)
+        T = _to_still_axes(_shifted(best.T_slice_model, lever), info)
+        C = _rotated(G @ best.covariance @ G.T, info)
+        kind = self.options.prediction
+        if prediction is None:
+            learnt = None if self._past is None else self._past.motion.intensity
+            state = motion.start(T, C, kind, learnt)
+        else:
+            innovation = poses.difference(T, prediction.motion.T)
+            state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind)
+        if method == "registered":
+            projection = project(best.T_slice_model, model.starts, model.directions)
+            self._kept_jacobian = np.nan_to_num(motion_field(best.T_slice_model, projection))
+        tracked = Tracked(
+            registration=sure,
+            method="reacquired" if self._is_lost else method,
+            stability=margin,
+            velocity=_velocity(state, info, lever) if kind == "velocity" and info.time_s is not None else None,
+        )
+        self._is_lost = False
+        self._past = _Past(motion=state, info=info, spots_px=spots.uv_px, tracked=tracked)
         return tracked
 
 
-def _settled_by_past(registration: Registration, prediction: Prediction) -> Registration:
-    """An ambiguous slice becomes ``ok`` when the past, certain until now, allows exactly one of its poses."""
-    allowed = []
-    for c in registration.candidates:
-        innovation = poses.difference(c.T_slice_model, prediction.T)
-        if float(innovation @ np.linalg.solve(prediction.covariance + c.covariance, innovation)) < _INNOVATION2:
-            allowed.append(c)
-    if len(allowed) != 1:
-        return registration
-    return replace(
-        registration,
-        status="ok",
-        reason="",
-        candidates=(allowed[0],),
-        warnings=(*registration.warnings, ("settled_by_past", "another pose explains the spots; the past excludes it")),
-    )
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Followed:
+    """Where the servo brought the frame, and with which spots."""
+
+    #: (n,) spot of each rod, −1 for none
+    spot_of_rod: IntArray
+    servo: ServoResult
 
 
-def _spot_of_rod(model: RodModel, best: Candidate) -> IntArray:
-    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
-    spot_of_rod[0, best.rod_index] = best.spot_index
-    return spot_of_rod
+def continues(candidate: Candidate, prediction: Prediction) -> bool:
+    """Whether a pose lies where the past said it would."""
+    innovation = poses.difference(candidate.T_slice_model, prediction.T)
+    distance2 = innovation @ np.linalg.solve(prediction.covariance + candidate.covariance, innovation)
+    return bool(distance2 < CONTINUES_D2)
 
 
-def _spot_scene(spots: Spots, scale: Scale) -> Scene:
-    s = scale.mm_per_px
-    return Scene(xy_mm=spots.uv_px * s, covariance_mm=spots.covariance_px * (s[:, None] * s), prior=PosePrior())
+def _velocity(state: motion.MotionState, info: SliceInfo, lever: FloatArray) -> Velocity | None:
+    """The middle's velocity as the model origin's, slice axes; None after one slice only."""
+    if state.n_slices < 2:
+        return None
+    twist, covariance = state.velocity, state.covariance[6:, 6:]
+    if info.T_patient_slice is not None:
+        Rt = info.T_patient_slice[:3, :3].T
+        twist = np.concatenate([Rt @ twist[:3], Rt @ twist[3:]])
+    G = motion.about_middle(-lever)
+    return Velocity(twist=G @ twist, covariance=G @ _rotated(covariance, info, back=True) @ G.T)
+
+
+def _shifted(T: FloatArray, shift: FloatArray) -> FloatArray:
+    moved = T.copy()
+    moved[:3, 3] += shift
+    return moved
+
+
+def _to_still_axes(T: FloatArray, info: SliceInfo) -> FloatArray:
+    """A pose in the slice as a pose in axes the table does not move."""
+    return T if info.T_patient_slice is None else info.T_patient_slice @ T
+
+
+def _from_still_axes(T: FloatArray, info: SliceInfo) -> FloatArray:
+    return T if info.T_patient_slice is None else poses.inverse(info.T_patient_slice) @ T
+
+
+def _rotated(covariance: FloatArray, info: SliceInfo, *, back: bool = False) -> FloatArray:
+    """(6, 6) from slice axes to axes the table does not move (or back)."""
+    if info.T_patient_slice is None:
+        return covariance
+    B = np.zeros((6, 6))
+    B[:3, :3] = B[3:, 3:] = info.T_patient_slice[:3, :3].T if back else info.T_patient_slice[:3, :3]
+    return B @ covariance @ B.T

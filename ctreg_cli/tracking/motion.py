@@ -1,0 +1,154 @@
+"""How the frame moves: a Kalman filter of its pose and velocity that learns from the slices how steadily it moves.
+
+The state is the pose and the velocity of the frame's middle, in axes that the table does not move (patient axes where
+the slices have patient geometry, slice axes elsewhere). The velocity drifts as a Wiener process; its intensity, one
+number for translation and one for rotation, follows the innovations by recursive maximum likelihood with a fading
+memory (Ljung & Söderström, *Theory and Practice of Recursive Identification*, 1983, §3.7). Errors live in the tangent
+space of the pose (``R ← exp([Ω]ₓ) R``, ``c ← c + V``), covariances are 12 × 12: pose error, then velocity error.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.plucker import skew
+
+Prediction = Literal["velocity", "identity"]
+
+_DEG = math.radians(1.0)
+#: velocity of a frame of which nothing is known, sd, mm/s and rad/s: breathing, not a fall
+FIRST_VELOCITY_SD = (6.0, 3.0 * _DEG)
+#: intensity of the velocity's drift to start from, mm²/s³ and rad²/s³; it is never taken to be less than the second
+FIRST_INTENSITY = (20.0, 20.0 * _DEG**2)
+LEAST_INTENSITY = (0.05, 0.05 * _DEG**2)
+MOST_INTENSITY = (1e5, 1e5 * _DEG**2)
+#: a slice is never predicted better than this, and the doubt grows with time, sd, mm and rad (a second: per √s)
+LEAST_STEP_SD = (0.15, 0.15 * _DEG)
+DOUBT_SD = (0.3, 0.3 * _DEG)
+#: how fast old innovations are forgotten, and the longest step (ln) that one slice may change an intensity by
+MEMORY, LEAST_LOG_STEP, MOST_LOG_STEP = 0.95, -0.5, 2.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionState:
+    """What is known of the frame's motion at one time."""
+
+    #: (4, 4) model axes, origin in the frame's middle → axes that the table does not move, mm
+    T: FloatArray
+    #: (6,) of the frame's middle, mm/s and rad/s
+    velocity: FloatArray
+    #: (12, 12) of pose and velocity
+    covariance: FloatArray
+    #: (2,) intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
+    intensity: FloatArray
+    information: FloatArray
+    #: slices that have gone into it
+    n_slices: int = 1
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(6, 6) of the pose, about the frame's middle."""
+        return self.covariance[:6, :6]
+
+
+def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: FloatArray | None = None) -> MotionState:
+    """The motion of a frame seen once.
+
+    Args:
+        T: (4, 4) its pose, origin in the middle.
+        covariance: (6, 6) of it.
+        kind: ``velocity``, or ``identity``: the frame stays where it is but for chance.
+        intensity: (2,) what was learnt of the motion before.
+    """
+    full = np.zeros((12, 12))
+    full[:6, :6] = covariance
+    if kind == "velocity":
+        full[_VELOCITY, _VELOCITY] = np.square(_each_axis(FIRST_VELOCITY_SD))
+    return MotionState(
+        T=T,
+        velocity=np.zeros(6),
+        covariance=full,
+        intensity=np.array(FIRST_INTENSITY) if intensity is None else intensity,
+        information=np.zeros(2),
+    )
+
+
+def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
+    """The motion ``dt_s`` later."""
+    P = np.array(state.covariance)
+    spread = np.repeat(state.intensity, 3)
+    if kind == "velocity":
+        P[:6] += dt_s * P[6:]
+        P[:, :6] += dt_s * P[:, 6:]
+        P[_POSE, _POSE] += spread * dt_s**3 / 3
+        P[_POSE, _VELOCITY] += spread * dt_s**2 / 2
+        P[_VELOCITY, _POSE] += spread * dt_s**2 / 2
+        P[_VELOCITY, _VELOCITY] += spread * dt_s
+    else:
+        P[_POSE, _POSE] += spread * dt_s
+    P[_POSE, _POSE] += _LEAST_STEP2 + _DOUBT2 * dt_s
+    return replace(state, T=poses.update(state.T, dt_s * state.velocity), covariance=P)
+
+
+def correct(
+    predicted: MotionState, innovation: FloatArray, covariance: FloatArray, dt_s: float, kind: Prediction
+) -> MotionState:
+    """The motion with a measured pose taken in.
+
+    Args:
+        predicted: the motion at the time of the measurement.
+        innovation: (6,) twist about the frame's middle from the predicted to the measured pose.
+        covariance: (6, 6) of the measured pose.
+        dt_s: time since the last measurement.
+        kind: as for :func:`start`.
+    """
+    S = predicted.pose_covariance + covariance
+    S_inverse = np.asarray(np.linalg.inv(S))
+    gain = predicted.covariance[:, :6] @ S_inverse
+    step = gain @ innovation
+    P = predicted.covariance - gain @ predicted.covariance[:6]
+    intensity, information = _learn(predicted, S_inverse, innovation, dt_s, kind)
+    return MotionState(
+        T=poses.update(predicted.T, step[:6]),
+        velocity=predicted.velocity + step[6:],
+        covariance=0.5 * (P + P.T),
+        intensity=intensity,
+        information=information,
+        n_slices=predicted.n_slices + 1,
+    )
+
+
+def _learn(
+    predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
+) -> tuple[FloatArray, FloatArray]:
+    """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
+    share = np.repeat(predicted.intensity, 3) * (dt_s**3 / 3 if kind == "velocity" else dt_s)
+    z = S_inverse @ innovation
+    score = 0.5 * (share * (z * z - np.diagonal(S_inverse))).reshape(2, 3).sum(axis=1)
+    weighted = (S_inverse * share).reshape(2, 3, 2, 3)
+    information = np.array([0.5 * np.sum(weighted[i, :, i] * weighted[i, :, i].T) for i in range(2)])
+    information = MEMORY * predicted.information + information
+    log_step = np.minimum(np.maximum(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
+    intensity = predicted.intensity * np.exp(log_step)
+    return np.minimum(np.maximum(intensity, LEAST_INTENSITY), MOST_INTENSITY), information
+
+
+def about_middle(lever_mm: FloatArray) -> FloatArray:
+    """(6, 6) that takes a twist at the model origin to the one at a point ``lever_mm`` (3,) away: ``V + Ω × lever``."""
+    G = np.eye(6)
+    G[:3, 3:] = -skew(lever_mm)
+    return G
+
+
+def _each_axis(pair: tuple[float, float]) -> FloatArray:
+    return np.repeat(np.array(pair, dtype=np.float64), 3)
+
+
+_POSE, _VELOCITY = np.arange(6), np.arange(6, 12)
+_LEAST_STEP2, _DOUBT2 = np.square(_each_axis(LEAST_STEP_SD)), np.square(_each_axis(DOUBT_SD))

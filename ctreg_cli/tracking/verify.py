@@ -1,0 +1,189 @@
+"""Whether a followed frame may be believed at once.
+
+A servo that converged proves nothing yet: a false spot beside a rod, two rods exchanged, a twin minimum or a second
+pose of a symmetric frame converge as well. All of these leave traces: a spot that the others do not predict, two spots
+that fit one rod, a pose known badly, a prediction too vague to tell two minima apart. Without any trace the pose is
+sure; with one it is not refused, but looked into (:mod:`~ctreg_cli.tracking.tracker`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import chdtrc, gammaln
+
+from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.projection import project
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.evidence import P_SEEN
+from ctreg_cli.registration.matching import Scene, visibility
+from ctreg_cli.registration.refine import invert_2x2
+from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MISS_P, fit_warnings, near_misses_p
+from ctreg_cli.registration.result import Candidate, Registration
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.servo import ServoResult
+
+#: matches that leave a redundancy to check by: four spots leave two equations, too few to contradict a false one
+CHECKABLE_MATCHES = 5
+#: a spot this far (χ² of two degrees of freedom) from where the others predict it is odd: 1 in 500
+ODD_D2 = 12.5
+#: a second spot within this of where the others predict a rod's could be the rod's
+CONTEST_D2 = 25.0
+#: expected number of false spots within a rod's gate above which the spot there is not taken for granted
+CHANCE_IN_GATE = 0.02
+#: a prediction or a pose known worse than this (sd of the worst turn, rad) does not exclude a twin, or is not linear
+VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
+#: innovations beyond this (χ² of six degrees of freedom: 1 in 30,000) are looked into
+_ODD_INNOVATION2 = 30.0
+#: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
+_TOUCHING_DIAMETERS, _TOUCHING_SIZE = 2.0, 0.05
+
+
+def verified(
+    model: RodModel,
+    scene: Scene,
+    scale: Scale,
+    spots: Spots,
+    T_predicted: FloatArray,
+    predicted_covariance: FloatArray,
+    moved: ServoResult,
+    spot_of_rod: IntArray,
+) -> Registration | None:
+    """The verdict ``ok`` on a followed frame, or None where something is in doubt.
+
+    Args:
+        model: the rods.
+        scene: the spots, mm.
+        scale: mm per pixel.
+        spots: the same spots, px.
+        T_predicted: (4, 4) where the past expected the frame.
+        predicted_covariance: (6, 6) of it.
+        moved: where the servo brought it.
+        spot_of_rod: (n,) spot of each rod, −1 for none.
+    """
+    view, T, C = moved.view, moved.T, moved.covariance
+    rods = np.nonzero(spot_of_rod >= 0)[0]
+    dof = 2 * len(rods) - 6
+    chi2 = view.chi2
+    p_chi2 = float(chdtrc(dof, chi2))
+    if len(rods) < CHECKABLE_MATCHES or p_chi2 < INFLATE_P or not scene.prior.allows(T[:3, :3]):
+        return None
+    if _worst_turn(C) > VAGUE_POSE_RAD or _worst_turn(predicted_covariance) > VAGUE_PREDICTION_RAD:
+        return None
+    projection = project(T, model.starts, model.directions)
+    may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
+    missing = np.nonzero(must & (spot_of_rod < 0))[0]
+    if not may[rods].all() or len(missing) > len(rods) or _touching(model, projection.xy_mm, rods, missing):
+        return None
+    if _contested(scene, moved, spot_of_rod[rods]):
+        return None
+    innovation = poses.difference(T, T_predicted)
+    S = predicted_covariance + C
+    distance2 = float(innovation @ np.linalg.solve(S, innovation))
+    if distance2 > _ODD_INNOVATION2:
+        return None
+    odds = _log_odds(model, scene, projection.xy_mm, moved, rods, missing, distance2, S)
+    if not odds > ACCEPT_LOG_ODDS:
+        return None
+    residual = view.residual_px / scale.mm_per_px
+    best = Candidate(
+        T_slice_model=frozen(T, (4, 4)),
+        covariance=frozen(C, (6, 6)),
+        rod_index=frozen_index(rods),
+        spot_index=frozen_index(spot_of_rod[rods]),
+        residual_px=frozen(residual, (None, 2)),
+        lambda_mm=frozen(view.lambda_mm, (None,)),
+        missing_rods=frozen_index(missing),
+        missing_px=frozen(projection.xy_mm[missing] / scale.mm_per_px, (None, 2)),
+        rms_px=float(np.sqrt(np.mean(residual**2))),
+        chi2=chi2,
+        degrees_of_freedom=dof,
+        log_odds=odds,
+        iterations=moved.iterations,
+    )
+    if near_misses_p(scene, scale, best) < NEAR_MISS_P:
+        return None
+    return Registration(
+        status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=fit_warnings(model, spots, best)
+    )
+
+
+def _worst_turn(covariance: FloatArray) -> float:
+    """Sd of the worst-known rotation, rad."""
+    return math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+
+
+def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> bool:
+    """Whether a rod that is seen, or should be, lies on a seen one's crossing: their spots may be one."""
+    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
+    reach = _TOUCHING_DIAMETERS * max(diameters) if diameters else _TOUCHING_SIZE * model.size_mm
+    there = np.concatenate([xy_mm[rods], xy_mm[missing]])
+    gap2 = ((there[:, None] - xy_mm[rods]) ** 2).sum(axis=-1)
+    return int((gap2 < reach**2).sum()) > len(rods)  # each lies on itself
+
+
+def _contested(scene: Scene, moved: ServoResult, spots: IntArray) -> bool:
+    """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance.
+
+    Leaving spot i out changes the prediction of it by ``Σ (Σ − J C Jᵀ)⁻¹ r`` and gives it the covariance
+    ``Σ (Σ − J C Jᵀ)⁻¹ Σ`` (the hat matrix of regression).
+    """
+    view = moved.view
+    k = len(spots)
+    J = view.jacobian.reshape(k, 2, 6)
+    own = view.covariance_px
+    left = invert_2x2(own - J @ moved.covariance @ J.transpose(0, 2, 1))
+    r = view.residual_px[:, :, None]
+    if not (left[:, 0, 0] > 0).all() or float((r.transpose(0, 2, 1) @ left @ r).max()) > ODD_D2:
+        return True
+    gate = own @ left @ own
+    det = gate[:, 0, 0] * gate[:, 1, 1] - gate[:, 0, 1] * gate[:, 1, 0]
+    if not (det > 0).all():
+        return True
+    free = len(scene.xy_mm) - k
+    if free:
+        extent = np.ptp(scene.xy_mm, axis=0)
+        density = free / float(extent[0] * extent[1])
+        if float((math.pi * ODD_D2 * np.sqrt(det) * density).max()) > CHANCE_IN_GATE:
+            return True
+    predicted = scene.xy_mm[spots] - (own @ left @ r)[:, :, 0]
+    d = scene.xy_mm - predicted[:, None]  # (k, m, 2)
+    distance2 = ((d @ invert_2x2(gate)) * d).sum(axis=-1)
+    return int((distance2 < CONTEST_D2).sum()) > k
+
+
+def _log_odds(
+    model: RodModel,
+    scene: Scene,
+    xy_mm: FloatArray,
+    moved: ServoResult,
+    rods: IntArray,
+    missing: IntArray,
+    distance2: float,
+    S: FloatArray,
+) -> float:
+    """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone."""
+    seen = np.concatenate([xy_mm[rods], xy_mm[missing]])
+    centre = seen.mean(axis=0)
+    reach = max(1.25 * math.sqrt(float(((seen - centre) ** 2).sum(axis=1).max())), 1e-3 * model.size_mm)
+    near = int((((scene.xy_mm - centre) ** 2).sum(axis=1) <= reach**2).sum())
+    n = len(rods)
+    m = max(near, n)
+    _, logdet_C = np.linalg.slogdet(moved.covariance)
+    _, logdet_S = np.linalg.slogdet(S)
+    volume = min(-0.5 * distance2 + 0.5 * (float(logdet_C) - float(logdet_S)), 0.0)
+    W = moved.view.weight
+    det_w = W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0]
+    per_spot = n * (math.log(P_SEEN) - math.log(2 * math.pi)) + 0.5 * float(np.log(det_w).sum())
+    ways = float(gammaln(m - n + 0.5) - gammaln(m + 0.5))
+    return (
+        volume
+        + per_spot
+        - 0.5 * moved.view.chi2
+        + n * math.log(math.pi * reach**2)
+        + ways
+        + len(missing) * math.log(1 - P_SEEN)
+    )
