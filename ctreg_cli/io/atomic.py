@@ -78,3 +78,19 @@ def write_text(path: str | Path, text: str) -> None:
         file.abandon()
         raise
     file.commit()
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a binary file atomically.
+
+    Raises:
+        InputError: the file cannot be written there.
+    """
+    file = AtomicFile(path)
+    try:
+        # what is below the text stream takes bytes; nothing has been written as text
+        file.stream.buffer.write(data)
+    except BaseException:
+        file.abandon()
+        raise
+    file.commit()
