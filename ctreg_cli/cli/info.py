@@ -19,7 +19,7 @@ _PIPED_WIDTH = 240
 
 Images = Annotated[
     list[Path],
-    typer.Argument(metavar="INPUT...", help="DICOM or PNG files, folders of them.", show_default=False),
+    typer.Argument(metavar="INPUT", help="DICOM or PNG files, folders of them.", show_default=False),
 ]
 
 

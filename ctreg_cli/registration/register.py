@@ -24,9 +24,9 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
-#: a match is believed when its odds against chance exceed this (ln): chance is a rival like any other, and then some;
-#: false alarms measured by benchmarks/accuracy.py
-ACCEPT_LOG_ODDS = math.log(300)
+#: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed this
+#: (ln): chance is a rival like any other. False alarms measured by benchmarks/accuracy.py
+ACCEPT_LOG_ODDS = math.log(150)
 #: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
 ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 #: a rival within these odds of the best makes the slice ambiguous (contract §5)
@@ -127,6 +127,17 @@ def register(
     return decide(model, scene, spots, scale, matches)
 
 
+def _log_others(matches: Matches) -> float:
+    """ln of the odds of chance (1) and of all matches that share less than half with the best, together.
+
+    In dense clutter one chance match stands among many that are nearly as good.
+    """
+    best = matches.spot_of_rod[0]
+    shared = ((matches.spot_of_rod == best) & (best >= 0)).sum(axis=1)
+    others = matches.log_odds[2 * shared < (best >= 0).sum()]
+    return float(np.log1p(np.exp(np.minimum(others, 50)).sum()))
+
+
 def accepted_log_odds(n_matches: int) -> float:
     """The ln odds that a match of so many spots must exceed."""
     return ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
@@ -143,7 +154,7 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
 
     if len(best.rod_index) < len(best.missing_rods):
         return refused("no_consistent_match")
-    if best.log_odds < accepted_log_odds(len(best.rod_index)):
+    if best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index)):
         return refused("no_consistent_match")
     if chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P:
         return refused("bad_fit")

@@ -266,7 +266,7 @@ def _draw_legend(
     y: float,
 ) -> None:
     counts = [
-        (len(labels), "matched", MATCHED),
+        (len(labels), "labelled", MATCHED),
         (len(spots) - len(labels), "other spots" if labels else "spots", UNMATCHED),
         (n_missing, "missing", MISSING),
         (len(spots.rejected) if show_rejected else 0, "rejected", REJECTED),
