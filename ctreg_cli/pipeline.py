@@ -23,7 +23,7 @@ from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from ctreg_cli.tracking.tracker import Tracked, Tracker
+from ctreg_cli.tracking.tracker import Tracked, Tracker, Velocity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,6 +54,8 @@ class FrameResult:
     warnings: tuple[tuple[str, str], ...] = ()
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J (tracking only): the servo is stable while it is positive
     stability: float | None = None
+    #: how fast the frame moves (tracking only, where slices have times); slice axes, the table's own motion taken out
+    velocity: Velocity | None = None
 
     @property
     def best(self) -> Candidate | None:
@@ -104,11 +106,16 @@ def pose(
         segmentation: see :class:`SegmentationOptions`.
 
     Raises:
-        MissingScaleError: a slice has no scale and none was given.
+        MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
     """
     options = options or RegistrationOptions()
     segmentation = segmentation or SegmentationOptions()
+    seen_scale = scale is not None
     for place, item in enumerate(segment(slices, segmentation)):
+        seen_scale |= item.info.scale is not None
+        if seen_scale and scale is None and item.info.scale is None and not item.problem:
+            yield failure(place if item.index is None else item.index, item, "no_scale")
+            continue
         yield register_slice(place, item, model, scale=scale, options=options)
 
 
@@ -194,7 +201,13 @@ def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
 def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Tracked) -> FrameResult:
     index = place if item.index is None else item.index
     return frame_result(
-        index, item, tracker.model, tracked.registration, method=tracked.method, stability=tracked.stability
+        index,
+        item,
+        tracker.model,
+        tracked.registration,
+        method=tracked.method,
+        stability=tracked.stability,
+        velocity=tracked.velocity,
     )
 
 
@@ -225,6 +238,7 @@ def frame_result(
     *,
     method: str,
     stability: float | None = None,
+    velocity: Velocity | None = None,
 ) -> FrameResult:
     """A verdict, with the targets' places and accuracy, as a row."""
     best = registration.best
@@ -239,6 +253,7 @@ def frame_result(
         targets=() if best is None else target_accuracy(model, best, item.info.T_patient_slice),
         warnings=registration.warnings,
         stability=stability,
+        velocity=velocity,
     )
 
 

@@ -20,6 +20,7 @@ from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.tracker import Velocity
 
 SCHEMA = "ctreg/poses/1"
 
@@ -56,6 +57,10 @@ COLUMNS: Mapping[str, int | None] = {
     "inflation": 6,
     "stability": 6,
     "warnings": None,
+    "n_missing": None,
+    "n_false": None,
+    **dict.fromkeys(("vx_mm_s", "vy_mm_s", "vz_mm_s", "wx_deg_s", "wy_deg_s", "wz_deg_s"), 6),
+    **dict.fromkeys(("sd_vx_mm_s", "sd_vy_mm_s", "sd_vz_mm_s", "sd_wx_deg_s", "sd_wy_deg_s", "sd_wz_deg_s"), 6),
 }
 
 
@@ -140,6 +145,10 @@ def _fields(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
     }
     for candidate in accepted(result)[:1]:
         fields |= _pose_fields(candidate)
+        fields["n_missing"] = len(candidate.missing_rods)
+        fields["n_false"] = len(result.spots) - len(candidate.spot_index)
+    if result.velocity is not None:
+        fields |= _velocity_fields(result.velocity)
     return {name: _rounded(value, COLUMNS[name]) for name, value in fields.items()}
 
 
@@ -164,6 +173,16 @@ def _pose_fields(candidate: Candidate) -> dict[str, object]:
         "log_odds": float(candidate.log_odds),
         "inflation": float(candidate.inflation),
     }
+
+
+def _velocity_fields(velocity: Velocity) -> dict[str, object]:
+    twist, sd = velocity.twist.tolist(), np.sqrt(np.diagonal(velocity.covariance)).tolist()
+    names = ("vx_mm_s", "vy_mm_s", "vz_mm_s", "wx_deg_s", "wy_deg_s", "wz_deg_s")
+    to_units = (*3 * (float,), *3 * (math.degrees,))
+    fields: dict[str, object] = {}
+    for name, to_unit, value, value_sd in zip(names, to_units, twist, sd, strict=True):
+        fields |= {name: to_unit(value), f"sd_{name}": to_unit(value_sd)}
+    return fields
 
 
 def _evidence(result: FrameResult, header: ResultsHeader) -> dict[str, object]:

@@ -43,7 +43,7 @@ GATE_SD = 4.5
 LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 #: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
 _ASSIGNMENTS = 3
-#: the servo is done when all spots together move by less than this (sd); so many steps of gain 1 are enough for right labels
+#: the servo is done when all spots together move by less than this (sd); right labels never need so many steps of gain 1
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
