@@ -32,6 +32,15 @@ DEGREE = 8
 _BRANCH_2 = np.array([1.0, 1.0, -1.0, -1.0])
 _BRANCH_3 = np.array([1.0, -1.0, 1.0, -1.0])
 _POLISH_STEPS = 12
+#: the eight-degree Chebyshev interpolation: where G is evaluated on [-1, 1], and how values become coefficients
+_NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+_TO_COEFFICIENTS = np.linalg.inv(chebyshev.chebvander(_NODES, DEGREE)).T
+#: a double root comes out of the eigenvalues as a pair this far apart at most, in half intervals
+_DOUBLE_ROOT = 1e-3
+#: sine² of the angle below which two rods count as parallel: each point of one is then equally far from the other
+_PARALLEL = 1e-6
+#: the interval of λ₁ reaches this share of the rod beyond what the distances allow
+_MARGIN = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,21 +128,48 @@ def solve_three(
         ``T_slice_model`` (r, 4, 4) of all solutions and (r,) the spot triple each belongs to. Three parallel rods give none.
     """
     d2 = squared_distances(xy_mm)
-    low, high = -slack_mm, triples.lengths[:, :1] + slack_mm  # (g, 1)
+    low, high = _reachable(triples, d2, slack_mm, noise_mm)  # (h, 1)
     half = (high - low) / 2
-    nodes = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
-    values = _evaluate_G(triples.quadratics(low + half * (1 + nodes)).with_distances(d2))
+    values = _evaluate_G(triples.quadratics(low + half * (1 + _NODES)).with_distances(d2))
     values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), np.finfo(float).tiny)
-    coefficients = values @ np.linalg.inv(chebyshev.chebvander(nodes, DEGREE)).T
-    roots = _chebyshev_roots(coefficients)  # (h, 8) complex, on [-1, 1]
-    half = np.broadcast_to(half, (len(xy_mm), 1))
-    imaginary_limit = np.maximum(1e-6 * half, np.sqrt(8 * noise_mm * half)) if noise_mm else 1e-3 * half
-    keep = (np.abs(roots.real) <= 1 + 1e-6) & (np.abs(roots.imag) * half <= imaginary_limit)
+    roots = _chebyshev_roots(values @ _TO_COEFFICIENTS)  # (h, 8) complex, on [-1, 1]
+    imaginary_limit = np.maximum(_DOUBLE_ROOT * half, np.sqrt(8 * noise_mm * half))
+    keep = (np.abs(roots.real) <= 1 + _DOUBLE_ROOT) & (np.abs(roots.imag) * half <= imaginary_limit)
     hypothesis, _ = np.nonzero(keep)
-    lambda_1 = low + half[hypothesis, 0] * (1 + roots.real[keep])
+    # of two roots that rounding has made a complex pair, each starts on a side of its own
+    lambda_1 = low[hypothesis, 0] + half[hypothesis, 0] * (1 + (roots.real + roots.imag)[keep])
     lambdas, hypothesis = _branches(triples, d2, hypothesis, lambda_1)
-    residual_mm = max(4 * noise_mm, 1e-7 * float(half.max()))
+    residual_mm = max(4 * noise_mm, 1e-7 * float(triples.lengths.max()) / 2)
     return _finish(triples, xy_mm, d2, hypothesis, lambdas, slack_mm, residual_mm, _POLISH_STEPS)
+
+
+def _reachable(
+    triples: RodTriples, d2: FloatArray, slack_mm: float, noise_mm: float
+) -> tuple[FloatArray, FloatArray]:
+    """The part (low, high), each (h, 1), of the first rod from which both other rods are within reach: D₂ ≥ 0 and D₃ ≥ 0.
+
+    ``D_j = d_1j² − (distance from P₁ to line j)²`` is concave in λ₁, so that each bounds an interval. Where rods meet at a
+    corner and the triangle is small, that interval is a thousandth of the rod, and only on it do the roots of G stand apart.
+    """
+    p, y = triples.starts, triples.directions
+    gap, cosine = p[:, 1:] - p[:, :1], np.einsum("gjk,gk->gj", y[:, 1:], y[:, 0])
+    # D_j − d_1j² = −(a λ² − 2 b λ + c), with the parts across line j of what separates the rods
+    across = gap - np.einsum("gjk,gjk->gj", gap, y[:, 1:])[..., None] * y[:, 1:]
+    a = 1 - cosine**2
+    b = np.einsum("gjk,gk->gj", across, y[:, 0])
+    c = (across**2).sum(axis=-1)
+    nearly_parallel = a < _PARALLEL
+    middle = b / np.where(nearly_parallel, 1.0, a)
+    within2 = (np.sqrt(d2[:, :2]) + 4 * noise_mm) ** 2 - (c - np.where(nearly_parallel, 0.0, b * middle))
+    reach = np.sqrt(np.maximum(within2, 0) / np.where(nearly_parallel, 1.0, a))
+    least, most = -slack_mm, triples.lengths[:, :1] + slack_mm
+    length = most - least
+    margin = _MARGIN * length
+    start = np.where(nearly_parallel, least, middle - reach - 0.05 * reach).max(axis=1, keepdims=True) - margin
+    end = np.where(nearly_parallel, most, middle + reach + 0.05 * reach).min(axis=1, keepdims=True) + margin
+    low = np.clip(np.broadcast_to(start, (len(d2), 1)), least, most - margin)
+    high = np.clip(np.broadcast_to(end, (len(d2), 1)), low + margin, most)
+    return low, np.maximum(high, low + margin)
 
 
 def scan_three(
