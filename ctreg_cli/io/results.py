@@ -59,6 +59,7 @@ COLUMNS: Mapping[str, int | None] = {
     "warnings": None,
     "n_missing": None,
     "n_false": None,
+    "pl_mm": 6,
     **dict.fromkeys(("vx_mm_s", "vy_mm_s", "vz_mm_s", "wx_deg_s", "wy_deg_s", "wz_deg_s"), 6),
     **dict.fromkeys(("sd_vx_mm_s", "sd_vy_mm_s", "sd_vz_mm_s", "sd_wx_deg_s", "sd_wy_deg_s", "sd_wz_deg_s"), 6),
 }
@@ -145,6 +146,8 @@ def _fields(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
     }
     for candidate in accepted(result)[:1]:
         fields |= _pose_fields(candidate)
+        if len(candidate.protection_mm):  # the worst target; infinite where nothing bounds the error (null in JSON)
+            fields["pl_mm"] = float(candidate.protection_mm.max())
         fields["n_missing"] = len(candidate.missing_rods)
         fields["n_false"] = len(result.spots) - len(candidate.spot_index)
     if result.velocity is not None:
@@ -205,6 +208,7 @@ def _evidence(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
                 "position_slice": target.position_slice,
                 "position_patient": target.position_patient,
                 "tre_mm": target.tre_mm,
+                "pl_mm": target.pl_mm,
             }
             for target in result.targets
         ],

@@ -445,6 +445,7 @@ def observations(scene: Scene, spot_of_rod: IntArray) -> Observations:
         covariance_px=scene.covariance_mm[spot_of_rod],
         matched=spot_of_rod >= 0,
         mm_per_px=np.ones(2),
+        half_slab_mm=scene.half_slab_mm,
     )
 
 

@@ -34,12 +34,18 @@ class Observations:
     matched: BoolArray
     #: (2,) or (b, 2) ``[s_x, s_y]``
     mm_per_px: FloatArray
+    #: half the slab's thickness, mm; a rod that ends inside the slab leaves a spot off its crossing
+    half_slab_mm: float = 0.0
 
     def subset(self, rows: IntArray | BoolArray) -> Observations:
         """The hypotheses ``rows`` only."""
         scale = self.mm_per_px if self.mm_per_px.ndim == 1 else self.mm_per_px[rows]
         return Observations(
-            uv_px=self.uv_px[rows], covariance_px=self.covariance_px[rows], matched=self.matched[rows], mm_per_px=scale
+            uv_px=self.uv_px[rows],
+            covariance_px=self.covariance_px[rows],
+            matched=self.matched[rows],
+            mm_per_px=scale,
+            half_slab_mm=self.half_slab_mm,
         )
 
 
@@ -93,14 +99,35 @@ def invert_2x2(matrices: FloatArray) -> FloatArray:
     return result
 
 
-def spot_covariance(model: RodModel, slope: FloatArray, covariance_px: FloatArray, mm_per_px: FloatArray) -> FloatArray:
-    """Covariance (..., n, 2, 2) in px² of measured minus predicted spots: spot noise and the frame's tolerance."""
+def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, half_slab_mm: float) -> FloatArray:
+    """How far along ``slope`` (..., n) mm of z a spot may lie off its crossing because the rod ends inside the slab.
+
+    The spot is the mean of what metal the slab holds. Where a length of the slab's height is empty, its middle lies half
+    that length off the mid-plane, and the spot as much times the slope.
+    """
+    rise = 1 / np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of z per mm of rod
+    below = np.clip(half_slab_mm - lambda_mm * rise, 0, 2 * half_slab_mm)
+    above = np.clip(half_slab_mm - (model.lengths - lambda_mm) * rise, 0, 2 * half_slab_mm)
+    result: FloatArray = 0.5 * (below + above)
+    return result
+
+
+def spot_covariance(
+    model: RodModel,
+    slope: FloatArray,
+    covariance_px: FloatArray,
+    mm_per_px: FloatArray,
+    shift_mm: FloatArray | None = None,
+) -> FloatArray:
+    """Covariance (..., n, 2, 2) in px² of measured minus predicted spots: spot noise, the frame's tolerance, rod ends."""
     scale = mm_per_px[..., None, :]
     k = slope / scale
     extra = k[..., :, None] * k[..., None, :]
     extra[..., 0, 0] += 1 / scale[..., 0] ** 2
     extra[..., 1, 1] += 1 / scale[..., 1] ** 2
     result: FloatArray = covariance_px + (model.tolerances**2)[:, None, None] * extra
+    if shift_mm is not None:
+        result = result + (shift_mm**2)[..., None, None] * (k[..., :, None] * k[..., None, :])
     return result
 
 
@@ -111,9 +138,11 @@ def linearise(model: RodModel, T: FloatArray, observations: Observations) -> Lin
     scale = o.mm_per_px[..., None, :]
     predicted = projection.xy_mm / scale
     used = o.matched & np.isfinite(predicted).all(axis=-1)
-    W = invert_2x2(
-        spot_covariance(model, np.where(used[..., None], projection.slope, 0.0), o.covariance_px, o.mm_per_px)
-    )
+    slope = np.where(used[..., None], projection.slope, 0.0)
+    shift = None
+    if o.half_slab_mm > 0:
+        shift = rod_end_shift(model, slope, np.where(used, projection.lambda_mm, 0.5 * model.lengths), o.half_slab_mm)
+    W = invert_2x2(spot_covariance(model, slope, o.covariance_px, o.mm_per_px, shift))
     W = np.where(used[..., None, None], W, 0.0)
     r = np.where(used[..., None], o.uv_px - predicted, 0.0)
     J = motion_field(T, projection) / scale[..., None]

@@ -12,6 +12,7 @@ from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import PosePrior
+from ctreg_cli.registration.integrity import protection_levels
 from ctreg_cli.registration.matching import Matches, Scene, doubt, observations, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import (
@@ -124,7 +125,22 @@ def register(
     if matches is None:
         return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
     matches = doubt(model, scene, matches, least_matches=least)
-    return decide(model, scene, spots, scale, matches)
+    return decide(model, scene, spots, scale, matches, options)
+
+
+def protected(model: RodModel, scene: Scene, best: Candidate, options: RegistrationOptions) -> Candidate:
+    """The candidate with its protection levels."""
+    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
+    spot_of_rod[0, best.rod_index] = best.spot_index
+    level = protection_levels(
+        model,
+        best.T_slice_model,
+        best.covariance,
+        observations(scene, spot_of_rod),
+        options.integrity_risk,
+        inflation=best.inflation,
+    )
+    return replace(best, protection_mm=frozen(level, (None,)))
 
 
 def _log_others(matches: Matches) -> float:
@@ -143,8 +159,16 @@ def accepted_log_odds(n_matches: int) -> float:
     return ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
 
 
-def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: Matches) -> Registration:
+def decide(
+    model: RodModel,
+    scene: Scene,
+    spots: Spots,
+    scale: Scale,
+    matches: Matches,
+    options: RegistrationOptions | None = None,
+) -> Registration:
     """The verdict on a slice's matches, best first."""
+    options = options or RegistrationOptions()
     near_rows = np.nonzero(matches.log_odds > matches.log_odds[0] - math.log(RIVAL_ODDS))[0]
     candidates = refined_candidates(model, scene, spots, scale, matches.subset(near_rows))
     best = candidates[0]
@@ -178,6 +202,9 @@ def decide(model: RodModel, scene: Scene, spots: Spots, scale: Scale, matches: M
         warnings.append(
             ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
         )
+    best = protected(model, scene, best, options)
+    if options.alert_limit_mm is not None and not rivals and best.protection_mm.max() > options.alert_limit_mm:
+        return refused("unprotected")
     warnings.extend(fit_warnings(model, spots, best))
     if rivals:
         chosen = _distinct_poses([best, *rivals])

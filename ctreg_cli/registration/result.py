@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
+from ctreg_cli.scale import Scale
 
 Status = Literal["ok", "ambiguous", "no_pose"]
 
@@ -41,6 +42,12 @@ class Candidate:
     #: factor by which standard deviations were widened because the spots were worse than believed; 1 when they were not
     inflation: float = 1.0
     iterations: int = 0
+    #: (p,) protection level at each target, or at the frame's centre where it has none, mm; empty when not worked out
+    #: (see :mod:`ctreg_cli.registration.integrity`)
+    protection_mm: FloatArray = field(default_factory=lambda: np.empty(0))
+    #: the scale estimated along with the pose, and (2, 2) its covariance; None where it was known
+    scale: Scale | None = None
+    scale_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
