@@ -178,7 +178,7 @@ def decide(
 
     if len(best.rod_index) < len(best.missing_rods):
         return refused("no_consistent_match")
-    if best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index)):
+    if best.log_odds < accepted_log_odds(len(best.rod_index)):
         return refused("no_consistent_match")
     if chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P:
         return refused("bad_fit")
@@ -188,6 +188,8 @@ def decide(
         return refused("singular_geometry")
     doubts = [c for c in candidates[1:] if _knows_less(c, best)]
     rivals = [c for c in candidates[1:] if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
+    if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index)):
+        return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
     widened, factor = widen_where_curved(model, scene, matches, best)
     if widened is None:
