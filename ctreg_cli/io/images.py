@@ -158,7 +158,7 @@ def _find(paths: Sequence[Path]) -> _Found:
     skipped: Counter[str] = Counter()
     for number, path in enumerate(paths):
         for file, source in files_in(path, skipped):
-            records = _read_file(file, source)
+            records = read_image_file(file, source)
             if isinstance(records, str):
                 skipped[records] += 1
                 continue
@@ -180,7 +180,7 @@ def _find(paths: Sequence[Path]) -> _Found:
     return _Found(groups=list(by_key.values()), lost=lost, skipped=dict(skipped))
 
 
-def _read_file(path: Path, source: str) -> list[ImageRecord] | str:
+def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
     """The records of one file, or why it is skipped."""
     from ctreg_cli.io.dicom import NotAnImage, is_dicom, read_dicom
 

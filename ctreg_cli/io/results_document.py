@@ -307,7 +307,7 @@ def _record(entry: _Result, raw: Mapping[str, object]) -> SliceRecord:
     # a pose without an accepted status is none, whatever the file holds
     has_pose = entry.status != "no_pose"
     # of what later versions add, columns are the plain values; an absent matrix is null too, and no column
-    columns = {name: value for name, value in raw.items() if isinstance(value, str | int | float)}
+    columns: dict[str, object] = {n: value for n, value in raw.items() if isinstance(value, str | int | float)}
     columns["warnings"] = ";".join(warning.code for warning in entry.warnings)
     return SliceRecord(
         index=entry.slice,

@@ -98,7 +98,7 @@
     g.clearRect(0, 0, box.width, box.height);
     if (!slices.length) return;
     const turn = camera.turn * Math.PI / 180, tilt = camera.tilt * Math.PI / 180;
-    const scale = 0.62 * Math.min(box.width, box.height) / radius * camera.zoom;
+    const scale = 0.56 * Math.min(box.width, box.height) / radius * camera.zoom;
     const project = (p) => {
       const x = p[0] - middle[0], y = p[1] - middle[1], z = p[2] - middle[2];
       const a = Math.cos(turn) * x - Math.sin(turn) * y, b = Math.sin(turn) * x + Math.cos(turn) * y;
