@@ -8,6 +8,7 @@ Scenes come from ``tests/oracle.py``, which shares no code with the package.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections import Counter
@@ -23,8 +24,9 @@ from ctreg_cli import pipeline
 from ctreg_cli.registration.options import TrackingOptions
 from tests.tracking.sequences import error_of, is_wrong, sequence
 
-#: a slice is decidable when so many rods left a spot
-DECIDABLE_RODS = 5
+#: a slice is decidable when so many rods left a spot, and these bound every turn by so much (sd, rad): beyond, the
+#: problem is not linear, and no pose with a covariance can be stated
+DECIDABLE_RODS, DECIDABLE_SD_RAD = 5, math.radians(3.0)
 
 
 def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> dict[str, object]:
@@ -37,6 +39,7 @@ def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> dict[str, object]:
     seconds = time.perf_counter() - began
     for i, (result, true) in enumerate(zip(results, made.truth, strict=True)):
         decidable = len(true.rods) >= DECIDABLE_RODS and true.bound is not None
+        decidable = decidable and math.sqrt(np.linalg.eigvalsh(true.bound[3:, 3:])[-1]) <= DECIDABLE_SD_RAD
         counts["decidable"] += decidable
         counts[f"{result.status}:{result.method or result.reason}"] += 1
         if decidable and result.status != "ok":
@@ -55,7 +58,7 @@ def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> dict[str, object]:
                     f"{np.linalg.norm(error[:3]):.2f} mm {np.degrees(np.linalg.norm(error[3:])):.2f} deg "
                     f"nees {nees[-1]:.0f} odds {best.log_odds:.1f}"
                 )
-            if decidable and len(true.rods) > DECIDABLE_RODS:
+            if decidable:
                 squares.append(error**2)
                 bounds.append(np.diag(true.bound))
     return {"counts": counts, "nees": nees, "squares": squares, "bounds": bounds, "notes": notes, "seconds": seconds}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,6 +36,9 @@ class TargetAccuracy:
     position_patient: FloatArray | None
     #: predicted root-mean-square error of the position, mm
     tre_mm: float
+    #: protection level: the error exceeds it with at most the stated risk, mm; infinite where nothing bounds it,
+    #: None where it was not worked out
+    pl_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,6 +59,8 @@ class FrameResult:
     stability: float | None = None
     #: how fast the frame moves (tracking only, where slices have times); slice axes, the table's own motion taken out
     velocity: Velocity | None = None
+    #: the motion before, if any, does not lead here (tracking only): the first slice, or one after a jump
+    begins: bool = False
 
     @property
     def best(self) -> Candidate | None:
@@ -200,15 +205,8 @@ def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
 
 def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Tracked) -> FrameResult:
     index = place if item.index is None else item.index
-    return frame_result(
-        index,
-        item,
-        tracker.model,
-        tracked.registration,
-        method=tracked.method,
-        stability=tracked.stability,
-        velocity=tracked.velocity,
-    )
+    result = frame_result(index, item, tracker.model, tracked.registration, method=tracked.method)
+    return replace(result, stability=tracked.stability, velocity=tracked.velocity, begins=tracked.begins)
 
 
 def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
@@ -237,8 +235,6 @@ def frame_result(
     registration: Registration,
     *,
     method: str,
-    stability: float | None = None,
-    velocity: Velocity | None = None,
 ) -> FrameResult:
     """A verdict, with the targets' places and accuracy, as a row."""
     best = registration.best
@@ -252,8 +248,6 @@ def frame_result(
         candidates=registration.candidates,
         targets=() if best is None else target_accuracy(model, best, item.info.T_patient_slice),
         warnings=registration.warnings,
-        stability=stability,
-        velocity=velocity,
     )
 
 
@@ -264,11 +258,16 @@ def target_accuracy(model: RodModel, best: Candidate, T_patient_slice: FloatArra
     """
     result = []
     T = best.T_slice_model
-    for target in model.targets:
+    for place, target in enumerate(model.targets):
         arm = T[:3, :3] @ target.point
         G = np.hstack([np.eye(3), -skew(arm)])
         position = arm + T[:3, 3]
         patient = None if T_patient_slice is None else T_patient_slice[:3, :3] @ position + T_patient_slice[:3, 3]
         tre = math.sqrt(float(np.trace(G @ best.covariance @ G.T)))
-        result.append(TargetAccuracy(id=target.id, position_slice=position, position_patient=patient, tre_mm=tre))
+        level = float(best.protection_mm[place]) if len(best.protection_mm) else None
+        result.append(
+            TargetAccuracy(
+                id=target.id, position_slice=position, position_patient=patient, tre_mm=tre, pl_mm=level
+            )
+        )
     return tuple(result)

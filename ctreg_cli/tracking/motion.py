@@ -139,11 +139,53 @@ def _learn(
     return np.minimum(np.maximum(intensity, LEAST_INTENSITY), MOST_INTENSITY), information
 
 
-def about_middle(lever_mm: FloatArray) -> FloatArray:
-    """(6, 6) that takes a twist at the model origin to the one at a point ``lever_mm`` (3,) away: ``V + Ω × lever``."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StillAxes:
+    """Between a slice and the axes in which motion is described, which the table does not move.
+
+    There a pose has its origin in the frame's middle (wherever the frame file put its own), and its axes are the
+    patient's where the slice has patient geometry; the slice's own elsewhere.
+    """
+
+    #: (3,) the frame's middle, model frame, mm
+    middle: FloatArray
+    #: (4, 4) or None
+    T_patient_slice: FloatArray | None
+
+    def pose(self, T_slice_model: FloatArray) -> FloatArray:
+        """The pose there of a pose in the slice."""
+        T = T_slice_model.copy()
+        T[:3, 3] += T[:3, :3] @ self.middle
+        return T if self.T_patient_slice is None else self.T_patient_slice @ T
+
+    def slice_pose(self, T: FloatArray) -> FloatArray:
+        """``T_slice_model`` of a pose there."""
+        T = T.copy() if self.T_patient_slice is None else poses.inverse(self.T_patient_slice) @ T
+        T[:3, 3] -= T[:3, :3] @ self.middle
+        return T
+
+    def twist(self, T_slice_model: FloatArray) -> FloatArray:
+        """(6, 6) that takes a twist at the model origin in slice axes to the one there."""
+        G = _about(T_slice_model[:3, :3] @ self.middle)
+        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]) @ G
+
+    def slice_twist(self, T_slice_model: FloatArray) -> FloatArray:
+        """The inverse of :meth:`twist`."""
+        G = _about(-T_slice_model[:3, :3] @ self.middle)
+        return G if self.T_patient_slice is None else G @ _turned(self.T_patient_slice[:3, :3].T)
+
+
+def _about(lever_mm: FloatArray) -> FloatArray:
+    """(6, 6) that takes a twist to the one at a point ``lever_mm`` (3,) away: ``V + Ω × lever``."""
     G = np.eye(6)
     G[:3, 3:] = -skew(lever_mm)
     return G
+
+
+def _turned(R: FloatArray) -> FloatArray:
+    B = np.zeros((6, 6))
+    B[:3, :3] = B[3:, 3:] = R
+    return B
 
 
 def _each_axis(pair: tuple[float, float]) -> FloatArray:

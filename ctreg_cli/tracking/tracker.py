@@ -33,7 +33,7 @@ from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.prior import PastPrior
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
-from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, verified
+from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
 CONTINUES_D2 = 35.0
@@ -43,7 +43,7 @@ GATE_SD = 4.5
 LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 #: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
 _ASSIGNMENTS = 3
-#: the servo is done when all spots together move by less than this (sd); right labels never need so many steps of gain 1
+#: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
@@ -69,6 +69,8 @@ class Tracked:
     stability: float | None = None
     #: None without a pose, without times, and in the first slice
     velocity: Velocity | None = None
+    #: the motion before, if any, does not lead here: the first slice, or one after a jump
+    begins: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,11 +145,10 @@ class Tracker:
             if dt_s < 0:
                 return None
         moved = motion.advance(past.motion, dt_s, self.options.prediction)
-        T = _from_still_axes(moved.T, info)
-        lever = -T[:3, :3] @ model.centre
-        T = _shifted(T, lever)
-        G = motion.about_middle(lever)
-        covariance = G @ _rotated(moved.pose_covariance, info, back=True) @ G.T
+        axes = self._axes(info)
+        T = axes.slice_pose(moved.T)
+        G = axes.slice_twist(T)
+        covariance = G @ moved.pose_covariance @ G.T
         projection = project(T, model.starts, model.directions)
         J = np.nan_to_num(motion_field(T, projection))
         reach = np.sqrt((J @ covariance * J).sum(axis=-1).max(axis=-1))
@@ -192,6 +193,8 @@ class Tracker:
                 sure = self._verified(prediction, scene, spots, scale, followed) or self._doubted(
                     prediction, scene, spots, scale, followed
                 )
+            if sure is not None and sure.status != "ok":
+                return self._lost(sure, prediction, scene)
             if sure is not None:
                 return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info)
         return self._registered(prediction, scene, spots, info, scale, followed, why)
@@ -218,6 +221,9 @@ class Tracker:
         self._is_lost = self._is_lost or self._past is not None
         if self._past is not None:
             self._past = replace(self._past, n_missed=self._past.n_missed + 1)
+
+    def _axes(self, info: SliceInfo) -> motion.StillAxes:
+        return motion.StillAxes(middle=self.model.centre, T_patient_slice=info.T_patient_slice)
 
     def _scene(self, spots: Spots, info: SliceInfo, scale: Scale) -> Scene:
         return make_scene(
@@ -302,10 +308,17 @@ class Tracker:
             return None
         matches = doubt(self.model, scene, matches, least_matches=LEAST_MATCHES)
         matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
-        verdict = decide(self.model, scene, spots, scale, matches)
+        verdict = decide(self.model, scene, spots, scale, matches, self.options.registration)
         if verdict.status != "ok" or not continues(verdict.candidates[0], prediction):
             return None
-        return verdict
+        return self._straight(verdict, prediction, scene)
+
+    def _straight(self, verdict: Registration, prediction: Prediction, scene: Scene) -> Registration:
+        """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``."""
+        best = verdict.candidates[0]
+        if agrees_with_past(self.model, scene, best, prediction.T, prediction.covariance):
+            return verdict
+        return replace(verdict, status="ambiguous", reason="not_linear")
 
     # --- 3. register -------------------------------------------------------------------------------------------------
 
@@ -330,18 +343,20 @@ class Tracker:
             weighed = matches
             if prediction is not None:
                 weighed = PastPrior.of(model, scene, prediction).applied(model, scene, matches)
-            verdict = decide(model, scene, spots, scale, weighed)
+            verdict = decide(model, scene, spots, scale, weighed, self.options.registration)
             if prediction is not None and verdict.status == "no_pose":
                 # nothing where the past expects it: the past is wrong, and the slice stands on its own
-                verdict = decide(model, scene, spots, scale, matches)
+                verdict = decide(model, scene, spots, scale, matches, self.options.registration)
         else:
             reason = "no_consistent_match" if pool else "too_few_spots"
             verdict = Registration(status="no_pose", reason=reason, n_spots=len(spots))
+        follows_on = prediction is not None and verdict.status == "ok" and continues(verdict.candidates[0], prediction)
+        if prediction is not None and follows_on:
+            verdict = self._straight(verdict, prediction, scene)
         if verdict.status != "ok":
             return self._lost(verdict, prediction, scene)
         if why:
             verdict = replace(verdict, warnings=(*verdict.warnings, ("registered_anew", why)))
-        follows_on = prediction is not None and continues(verdict.candidates[0], prediction)
         if self._past is not None and not follows_on:
             self._is_lost = True
         return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info)
@@ -373,10 +388,9 @@ class Tracker:
     ) -> Tracked:
         """Take a sure pose into the motion; ``prediction`` is None where a new motion begins."""
         best, model = sure.candidates[0], self.model
-        lever = best.T_slice_model[:3, :3] @ model.centre
-        G = motion.about_middle(lever)
-        T = _to_still_axes(_shifted(best.T_slice_model, lever), info)
-        C = _rotated(G @ best.covariance @ G.T, info)
+        axes = self._axes(info)
+        T, G = axes.pose(best.T_slice_model), axes.twist(best.T_slice_model)
+        C = G @ best.covariance @ G.T
         kind = self.options.prediction
         if prediction is None:
             learnt = None if self._past is None else self._past.motion.intensity
@@ -391,11 +405,19 @@ class Tracker:
             registration=sure,
             method="reacquired" if self._is_lost else method,
             stability=margin,
-            velocity=_velocity(state, info, lever) if kind == "velocity" and info.time_s is not None else None,
+            velocity=self._velocity(state, best.T_slice_model, info),
+            begins=prediction is None,
         )
         self._is_lost = False
         self._past = _Past(motion=state, info=info, spots_px=spots.uv_px, tracked=tracked)
         return tracked
+
+    def _velocity(self, state: motion.MotionState, T_slice_model: FloatArray, info: SliceInfo) -> Velocity | None:
+        """The middle's velocity as the model origin's, slice axes; None after one slice only, or without times."""
+        if self.options.prediction == "identity" or info.time_s is None or state.n_slices < 2:
+            return None
+        G = self._axes(info).slice_twist(T_slice_model)
+        return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -412,39 +434,3 @@ def continues(candidate: Candidate, prediction: Prediction) -> bool:
     innovation = poses.difference(candidate.T_slice_model, prediction.T)
     distance2 = innovation @ np.linalg.solve(prediction.covariance + candidate.covariance, innovation)
     return bool(distance2 < CONTINUES_D2)
-
-
-def _velocity(state: motion.MotionState, info: SliceInfo, lever: FloatArray) -> Velocity | None:
-    """The middle's velocity as the model origin's, slice axes; None after one slice only."""
-    if state.n_slices < 2:
-        return None
-    twist, covariance = state.velocity, state.covariance[6:, 6:]
-    if info.T_patient_slice is not None:
-        Rt = info.T_patient_slice[:3, :3].T
-        twist = np.concatenate([Rt @ twist[:3], Rt @ twist[3:]])
-    G = motion.about_middle(-lever)
-    return Velocity(twist=G @ twist, covariance=G @ _rotated(covariance, info, back=True) @ G.T)
-
-
-def _shifted(T: FloatArray, shift: FloatArray) -> FloatArray:
-    moved = T.copy()
-    moved[:3, 3] += shift
-    return moved
-
-
-def _to_still_axes(T: FloatArray, info: SliceInfo) -> FloatArray:
-    """A pose in the slice as a pose in axes the table does not move."""
-    return T if info.T_patient_slice is None else info.T_patient_slice @ T
-
-
-def _from_still_axes(T: FloatArray, info: SliceInfo) -> FloatArray:
-    return T if info.T_patient_slice is None else poses.inverse(info.T_patient_slice) @ T
-
-
-def _rotated(covariance: FloatArray, info: SliceInfo, *, back: bool = False) -> FloatArray:
-    """(6, 6) from slice axes to axes the table does not move (or back)."""
-    if info.T_patient_slice is None:
-        return covariance
-    B = np.zeros((6, 6))
-    B[:3, :3] = B[3:, 3:] = info.T_patient_slice[:3, :3].T if back else info.T_patient_slice[:3, :3]
-    return B @ covariance @ B.T

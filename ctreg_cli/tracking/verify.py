@@ -24,7 +24,7 @@ from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MIS
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from ctreg_cli.tracking.servo import ServoResult
+from ctreg_cli.tracking.servo import Desired, ServoResult, view
 
 #: matches that leave a redundancy to check by: four spots leave two equations, too few to contradict a false one
 CHECKABLE_MATCHES = 5
@@ -36,6 +36,8 @@ CONTEST_D2 = 25.0
 CHANCE_IN_GATE = 0.02
 #: a prediction or a pose known worse than this (sd of the worst turn, rad) does not exclude a twin, or is not linear
 VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
+#: steps to the pose most probable with the past; how far it may lie from the one without (χ² of six degrees of freedom)
+_MAP_STEPS, _AGREES_D2 = 6, 30.0
 #: innovations beyond this (χ² of six degrees of freedom: 1 in 30,000) are looked into
 _ODD_INNOVATION2 = 30.0
 #: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
@@ -64,10 +66,10 @@ def verified(
         moved: where the servo brought it.
         spot_of_rod: (n,) spot of each rod, −1 for none.
     """
-    view, T, C = moved.view, moved.T, moved.covariance
+    seen, T, C = moved.view, moved.T, moved.covariance
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
-    chi2 = view.chi2
+    chi2 = seen.chi2
     p_chi2 = float(chdtrc(dof, chi2))
     if len(rods) < CHECKABLE_MATCHES or p_chi2 < INFLATE_P or not scene.prior.allows(T[:3, :3]):
         return None
@@ -88,14 +90,14 @@ def verified(
     odds = _log_odds(model, scene, projection.xy_mm, moved, rods, missing, distance2, S)
     if not odds > ACCEPT_LOG_ODDS:
         return None
-    residual = view.residual_px / scale.mm_per_px
+    residual = seen.residual_px / scale.mm_per_px
     best = Candidate(
         T_slice_model=frozen(T, (4, 4)),
         covariance=frozen(C, (6, 6)),
         rod_index=frozen_index(rods),
         spot_index=frozen_index(spot_of_rod[rods]),
         residual_px=frozen(residual, (None, 2)),
-        lambda_mm=frozen(view.lambda_mm, (None,)),
+        lambda_mm=frozen(seen.lambda_mm, (None,)),
         missing_rods=frozen_index(missing),
         missing_px=frozen(projection.xy_mm[missing] / scale.mm_per_px, (None, 2)),
         rms_px=float(np.sqrt(np.mean(residual**2))),
@@ -109,6 +111,30 @@ def verified(
     return Registration(
         status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=fit_warnings(model, spots, best)
     )
+
+
+def agrees_with_past(
+    model: RodModel, scene: Scene, best: Candidate, T_predicted: FloatArray, predicted_covariance: FloatArray
+) -> bool:
+    """Whether the pose and the one most probable with the past taken in differ by no more than the covariance allows.
+
+    With few spots the cost is a long curved valley. Its lowest point may lie far from the truth, and the covariance
+    there, a straight ellipsoid, does not reach back; the past does, along the valley.
+    """
+    desired = Desired.of(
+        model, best.rod_index, scene.xy_mm[best.spot_index], scene.covariance_mm[best.spot_index], np.ones(2)
+    )
+    information = np.linalg.inv(predicted_covariance)
+    T = T_predicted
+    for _ in range(_MAP_STEPS):
+        here = view(desired, T)
+        if not np.isfinite(here.residual_px).all():
+            return False
+        WJ = here.weighted(here.jacobian)
+        gradient = WJ.T @ here.residual_px.reshape(-1) - information @ poses.difference(T, T_predicted)
+        T = poses.update(T, np.asarray(np.linalg.solve(WJ.T @ here.jacobian + information, gradient)))
+    apart = poses.difference(T, best.T_slice_model)
+    return bool(apart @ np.linalg.solve(best.covariance, apart) <= _AGREES_D2)
 
 
 def _worst_turn(covariance: FloatArray) -> float:
@@ -131,12 +157,12 @@ def _contested(scene: Scene, moved: ServoResult, spots: IntArray) -> bool:
     Leaving spot i out changes the prediction of it by ``Σ (Σ − J C Jᵀ)⁻¹ r`` and gives it the covariance
     ``Σ (Σ − J C Jᵀ)⁻¹ Σ`` (the hat matrix of regression).
     """
-    view = moved.view
+    seen = moved.view
     k = len(spots)
-    J = view.jacobian.reshape(k, 2, 6)
-    own = view.covariance_px
+    J = seen.jacobian.reshape(k, 2, 6)
+    own = seen.covariance_px
     left = invert_2x2(own - J @ moved.covariance @ J.transpose(0, 2, 1))
-    r = view.residual_px[:, :, None]
+    r = seen.residual_px[:, :, None]
     if not (left[:, 0, 0] > 0).all() or float((r.transpose(0, 2, 1) @ left @ r).max()) > ODD_D2:
         return True
     gate = own @ left @ own
