@@ -143,9 +143,7 @@ def solve_three(
     return _finish(triples, xy_mm, d2, hypothesis, lambdas, slack_mm, residual_mm, _POLISH_STEPS)
 
 
-def _reachable(
-    triples: RodTriples, d2: FloatArray, slack_mm: float, noise_mm: float
-) -> tuple[FloatArray, FloatArray]:
+def _reachable(triples: RodTriples, d2: FloatArray, slack_mm: float, noise_mm: float) -> tuple[FloatArray, FloatArray]:
     """The part (low, high), each (h, 1), of the first rod from which both other rods are within reach: D₂ ≥ 0 and D₃ ≥ 0.
 
     ``D_j = d_1j² − (distance from P₁ to line j)²`` is concave in λ₁, so that each bounds an interval. Where rods meet at a
