@@ -6,12 +6,13 @@ Everything is a generator, so that a progress bar, a robot and a file can each t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray, frozen
 from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots, measure_spots
@@ -23,6 +24,9 @@ from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.motion import StillAxes
+from ctreg_cli.tracking.servo import Desired, view
+from ctreg_cli.tracking.smoother import TimedPose, lasting_covariance, smooth
 from ctreg_cli.tracking.tracker import Tracked, Tracker, Velocity
 
 
@@ -193,6 +197,74 @@ def track_slice(
     return _tracked_result(place, item, tracker, tracked)
 
 
+def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | None = None) -> list[FrameResult]:
+    """The tracked motion in hindsight: each ``ok`` pose becomes the one most probable given all slices of its motion.
+
+    A motion ends where the frame jumped, or a new series begins; slices without a sure pose stay without one.
+
+    Args:
+        results: of :func:`track`, all of them.
+        model: the rods.
+        scale: as given to :func:`track`.
+    """
+    after = list(results)
+    sure = [i for i, result in enumerate(results) if result.status == "ok"]
+    starts = [n for n, i in enumerate(sure) if results[i].begins or not n]
+    for first, end in zip(starts, [*starts[1:], len(sure)], strict=True):
+        places = sure[first:end]
+        motion = [_timed_pose(results[i], model) for i in places]
+        if any(m.time_s < before.time_s for before, m in pairwise(motion)):
+            continue
+        for i, pose_ in zip(places, smooth(motion), strict=True):
+            after[i] = _with_pose(results[i], model, pose_, scale)
+    return after
+
+
+def _timed_pose(result: FrameResult, model: RodModel) -> TimedPose:
+    best = result.candidates[0]
+    axes = StillAxes(middle=model.centre, T_patient_slice=result.info.T_patient_slice)
+    G = axes.twist(best.T_slice_model)
+    return TimedPose(
+        time_s=float(result.index) if result.info.time_s is None else result.info.time_s,
+        T=axes.pose(best.T_slice_model),
+        covariance=G @ best.covariance @ G.T,
+    )
+
+
+def _with_pose(result: FrameResult, model: RodModel, pose_: TimedPose, scale: Scale | None) -> FrameResult:
+    """The result with a smoothed pose in place of its own; matches stay, their residuals are those of the new pose."""
+    best, info = result.candidates[0], result.info
+    axes = StillAxes(middle=model.centre, T_patient_slice=info.T_patient_slice)
+    T = axes.slice_pose(pose_.T)
+    G = axes.slice_twist(T)
+    used = scale or info.scale
+    assert used is not None  # there would be no pose
+    rods, spots = best.rod_index, best.spot_index
+    desired = Desired.of(model, rods, result.spots.uv_px[spots], result.spots.covariance_px[spots], used.mm_per_px)
+    seen = view(desired, T)
+    # rods beside their drawing err alike in all slices: what that adds to the pose is not averaged away
+    covariance = G @ pose_.covariance @ G.T + lasting_covariance(seen, desired)
+    candidate = replace(
+        best,
+        T_slice_model=frozen(T, (4, 4)),
+        covariance=frozen(covariance, (6, 6)),
+        residual_px=frozen(seen.residual_px, (None, 2)),
+        lambda_mm=frozen(seen.lambda_mm, (None,)),
+        rms_px=seen.rms_px,
+        chi2=seen.chi2,
+    )
+    velocity = result.velocity
+    if velocity is not None and pose_.velocity is not None and pose_.velocity_covariance is not None:
+        velocity = Velocity(twist=G @ pose_.velocity, covariance=G @ pose_.velocity_covariance @ G.T)
+    return replace(
+        result,
+        method="smoothed",
+        candidates=(candidate,),
+        targets=target_accuracy(model, candidate, info.T_patient_slice),
+        velocity=velocity,
+    )
+
+
 def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
     """Which predicted spots lie in the image."""
     if shape is None:
@@ -266,8 +338,6 @@ def target_accuracy(model: RodModel, best: Candidate, T_patient_slice: FloatArra
         tre = math.sqrt(float(np.trace(G @ best.covariance @ G.T)))
         level = float(best.protection_mm[place]) if len(best.protection_mm) else None
         result.append(
-            TargetAccuracy(
-                id=target.id, position_slice=position, position_patient=patient, tre_mm=tre, pl_mm=level
-            )
+            TargetAccuracy(id=target.id, position_slice=position, position_patient=patient, tre_mm=tre, pl_mm=level)
         )
     return tuple(result)

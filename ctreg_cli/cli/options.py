@@ -68,8 +68,8 @@ Outputs = Annotated[
         "--output",
         "-o",
         metavar="FILE",
-        help="Where to write: .csv, .json or .jsonl by suffix, - for CSV on standard output; may be given several "
-        "times.  [default: -]",
+        help="Where to write: .csv, .json, .jsonl (poses also .tum) by suffix, - for CSV on standard output; may be "
+        "given several times.  [default: -]",
         show_default=False,
     ),
 ]

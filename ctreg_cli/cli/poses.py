@@ -12,10 +12,10 @@ from ctreg_cli.cli.overlays import OverlayWriter
 from ctreg_cli.cli.run import Watched, choose_scale, close, consume, open_inputs
 from ctreg_cli.cli.summary import PoseTally
 from ctreg_cli.imaging.segmentation import SegmentationOptions
-from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding
+from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding, write_results
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.io.sinks import check_outputs, open_sinks
-from ctreg_cli.pipeline import FrameResult
+from ctreg_cli.pipeline import FrameResult, smoothed
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
@@ -42,7 +42,14 @@ class PoseArguments:
     verbose: bool
 
 
-def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], arguments: PoseArguments) -> None:
+def run_poses(
+    command: str,
+    estimate: Estimate,
+    options: Mapping[str, object],
+    arguments: PoseArguments,
+    *,
+    smooth: str | None = None,
+) -> None:
     """Write a result for every slice, then tell how it went.
 
     Args:
@@ -50,12 +57,15 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
         estimate: the method.
         options: its options as resolved, for the record.
         arguments: the rest of the command line.
+        smooth: where the trajectory smoothed in hindsight goes, if anywhere; all results are then kept until the end.
 
     Raises:
         CtregError: the model, the input, the scale or an output cannot be used.
         typer.Exit: code 1 when not one slice gave a pose, or with ``strict`` when any slice is not ``ok``.
     """
     outputs = check_outputs(arguments.output, arguments.inputs)
+    if smooth is not None:
+        check_outputs([*outputs, smooth], arguments.inputs)
     talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose, outputs=outputs)
     model = load_rod_model(arguments.model)
     source = open_inputs(arguments.inputs, talk, series=arguments.series, spot_sd_px=arguments.spot_sd)
@@ -71,6 +81,7 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
         options={"command": command, **options, "segmentation": asdict(segmentation)},
     )
     sinks = open_sinks(outputs, results_encoding(header, with_uids=arguments.with_uids), sys.stdout)
+    kept: list[FrameResult] = []
     watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
 
     def on_result(result: FrameResult) -> None:
@@ -79,6 +90,8 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
             talk.warn(doubt)
         tally.n_doubtful += bool(doubt)
         tally.add(result)
+        if smooth is not None:
+            kept.append(result)
         slice_ = watched.answered()
         if overlays and slice_:
             overlays.draw_result(slice_, result)
@@ -91,6 +104,8 @@ def run_poses(command: str, estimate: Estimate, options: Mapping[str, object], a
     except KeyboardInterrupt:
         talk.table(tally.rows())
         raise
+    if smooth is not None:
+        write_results(smoothed(kept, model, scale=scale.scale), smooth, header, with_uids=arguments.with_uids)
     talk.table(tally.rows())
     close(n_good=tally.n_poses, n_failed=tally.total - tally.n_ok, strict=arguments.strict)
 

@@ -2,7 +2,33 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
 from ctreg_cli.cli import options as opt
+
+
+class Prediction(StrEnum):
+    """Where the frame is expected in the next slice."""
+
+    velocity = "velocity"
+    identity = "identity"
+
+
+PredictionChoice = Annotated[
+    Prediction, typer.Option("--prediction", help="Expect the frame carried on by its velocity, or where it was.")
+]
+SmoothFile = Annotated[
+    str | None,
+    typer.Option(
+        "--smooth",
+        metavar="FILE",
+        help="Also write the motion as all slices together show it (.csv, .json, .jsonl or .tum).",
+        show_default=False,
+    ),
+]
 
 
 def track(
@@ -13,6 +39,8 @@ def track(
     output: opt.Outputs = None,
     jacobian: opt.JacobianChoice = opt.Jacobian.updated,
     gain: opt.Gain = opt.TRACKING.gain,
+    prediction: PredictionChoice = Prediction.velocity,
+    smooth: SmoothFile = None,
     use_mount: opt.UseMount = opt.REGISTRATION.use_mount,
     integrity_risk: opt.IntegrityRisk = opt.REGISTRATION.integrity_risk,
     alert_limit: opt.AlertLimit = opt.REGISTRATION.alert_limit_mm,
@@ -34,6 +62,7 @@ def track(
     Examples:
       ctreg track slices/ -m frame.yaml -o track.csv
       ctreg track slices/ -m frame.yaml --jacobian constant -o track.jsonl
+      ctreg track slices/ -m frame.yaml -o track.csv -o track.tum --smooth smooth.csv
     """
     from dataclasses import asdict
 
@@ -42,7 +71,9 @@ def track(
     from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 
     registration = RegistrationOptions(use_mount=use_mount, integrity_risk=integrity_risk, alert_limit_mm=alert_limit)
-    tracking = TrackingOptions(registration=registration, jacobian=jacobian.value, gain=gain)
+    tracking = TrackingOptions(
+        registration=registration, jacobian=jacobian.value, gain=gain, prediction=prediction.value
+    )
     run_poses(
         "track",
         lambda slices, frame, mm_per_px, segmentation: pipeline.track(
@@ -64,4 +95,5 @@ def track(
             quiet=quiet,
             verbose=verbose,
         ),
+        smooth=smooth,
     )

@@ -16,6 +16,7 @@ from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import InputError
 from ctreg_cli.geometry.pose import from_quaternion, quaternion
 from ctreg_cli.io.sinks import Encoding, open_sinks, rounded
+from ctreg_cli.io.tum import HEADER, tum_lines
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
@@ -105,7 +106,15 @@ def results_encoding(header: ResultsHeader, *, with_uids: bool = False) -> Encod
             "options": header.options,
         }
 
-    return Encoding(columns=list(COLUMNS), rows=row, record=record, header=head, records_key="results")
+    return Encoding(
+        columns=list(COLUMNS),
+        rows=row,
+        record=record,
+        header=head,
+        records_key="results",
+        trajectory=tum_lines,
+        trajectory_header=HEADER,
+    )
 
 
 def write_results(

@@ -25,7 +25,12 @@ from ctreg_cli.io.atomic import AtomicFile, check_folder
 Item = TypeVar("Item", contravariant=True)
 
 #: suffix → what it means, for help texts and errors
-FORMATS: Mapping[str, str] = {".csv": "table", ".json": "one document", ".jsonl": "one line a slice, as it is done"}
+FORMATS: Mapping[str, str] = {
+    ".csv": "table",
+    ".json": "one document",
+    ".jsonl": "one line a slice, as it is done",
+    ".tum": "trajectory, poses only",
+}
 STANDARD_OUTPUT = "-"
 
 
@@ -42,6 +47,9 @@ class Encoding(Generic[Item]):
     header: Callable[[Item | None], Mapping[str, object]]
     #: key of the list of records in a JSON document
     records_key: str
+    #: lines of a trajectory, and the comment above them; None where there is none
+    trajectory: Callable[[Item], Iterable[str]] | None = None
+    trajectory_header: str = ""
 
 
 class Sink(Protocol[Item]):
@@ -197,6 +205,30 @@ class JsonLinesFile(Generic[Item]):
             self._path.unlink(missing_ok=True)
 
 
+class TrajectoryFile(Generic[Item]):
+    """Lines of text, a pose each, that appear when complete.
+
+    Raises:
+        InputError: there are no poses in this encoding.
+    """
+
+    def __init__(self, path: Path, encoding: Encoding[Item]) -> None:
+        if encoding.trajectory is None:
+            raise InputError(f"-o {path}: a trajectory holds poses, and there are none here; use .csv, .json or .jsonl")
+        self._lines = encoding.trajectory
+        self._file = AtomicFile(path)
+        self._file.stream.write(encoding.trajectory_header + "\n")
+
+    def write(self, item: Item) -> None:
+        self._file.stream.writelines(f"{line}\n" for line in self._lines(item))
+
+    def finish(self) -> None:
+        self._file.commit()
+
+    def abandon(self) -> None:
+        self._file.abandon()
+
+
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C back while a record is written, so that an interrupted file still holds whole records only."""
@@ -233,6 +265,10 @@ class Sinks(Generic[Item]):
     @property
     def alive(self) -> bool:
         return bool(self._sinks)
+
+    def add(self, sink: Sink[Item]) -> None:
+        """One more output."""
+        self._sinks.append(sink)
 
     def write(self, item: Item) -> None:
         with _uninterrupted():
@@ -321,4 +357,6 @@ def _open(output: str, kind: str, encoding: Encoding[Item], standard_output: Tex
         return CsvFile(Path(output), encoding)
     if kind == ".json":
         return JsonFile(Path(output), encoding)
+    if kind == ".tum":
+        return TrajectoryFile(Path(output), encoding)
     return JsonLinesFile(Path(output), encoding)

@@ -296,6 +296,7 @@ class Tracker:
             prediction.covariance,
             followed.servo,
             followed.spot_of_rod,
+            self.options.registration,
         )
 
     # --- 2. doubt ----------------------------------------------------------------------------------------------------

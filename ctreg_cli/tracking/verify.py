@@ -9,16 +9,20 @@ sure; with one it is not refused, but looked into (:mod:`~ctreg_cli.tracking.tra
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc, gammaln
+from scipy.special import chdtrc, chdtri, gammaln
 
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.geometry.projection import project
+from ctreg_cli.geometry.plucker import skew
+from ctreg_cli.geometry.projection import Projection, project
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
+from ctreg_cli.registration.integrity import protected_points
 from ctreg_cli.registration.matching import Scene, visibility
+from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MISS_P, fit_warnings, near_misses_p
 from ctreg_cli.registration.result import Candidate, Registration
@@ -53,6 +57,7 @@ def verified(
     predicted_covariance: FloatArray,
     moved: ServoResult,
     spot_of_rod: IntArray,
+    options: RegistrationOptions,
 ) -> Registration | None:
     """The verdict ``ok`` on a followed frame, or None where something is in doubt.
 
@@ -65,6 +70,7 @@ def verified(
         predicted_covariance: (6, 6) of it.
         moved: where the servo brought it.
         spot_of_rod: (n,) spot of each rod, −1 for none.
+        options: the integrity risk, and the alert limit.
     """
     seen, T, C = moved.view, moved.T, moved.covariance
     rods = np.nonzero(spot_of_rod >= 0)[0]
@@ -80,7 +86,13 @@ def verified(
     missing = np.nonzero(must & (spot_of_rod < 0))[0]
     if not may[rods].all() or len(missing) > len(rods) or _touching(model, projection.xy_mm, rods, missing):
         return None
-    if _contested(scene, moved, spot_of_rod[rods]):
+    if rod_end_shift_mm(model, rods, projection, scene.half_slab_mm) > 0:
+        return None
+    without = LeftOut.of(moved)
+    if without is None or _contested(scene, moved, without, spot_of_rod[rods]):
+        return None
+    protection = without.protection_mm(protected_points(model), moved, options.integrity_risk)
+    if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
         return None
     innovation = poses.difference(T, T_predicted)
     S = predicted_covariance + C
@@ -105,6 +117,7 @@ def verified(
         degrees_of_freedom=dof,
         log_odds=odds,
         iterations=moved.iterations,
+        protection_mm=frozen(protection, (None,)),
     )
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return None
@@ -151,33 +164,79 @@ def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntAr
     return int((gap2 < reach**2).sum()) > len(rods)  # each lies on itself
 
 
-def _contested(scene: Scene, moved: ServoResult, spots: IntArray) -> bool:
-    """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance.
+def rod_end_shift_mm(model: RodModel, rods: IntArray, projection: Projection, half_slab_mm: float) -> float:
+    """How far in z a spot may lie off its crossing because a seen rod ends inside the slab, at most; mm."""
+    rise = 1 / np.sqrt(1 + (projection.slope[rods] ** 2).sum(axis=1))
+    to_end = np.minimum(projection.lambda_mm[rods], model.lengths[rods] - projection.lambda_mm[rods]) * rise
+    return max(0.0, half_slab_mm - float(to_end.min()))
 
-    Leaving spot i out changes the prediction of it by ``Σ (Σ − J C Jᵀ)⁻¹ r`` and gives it the covariance
-    ``Σ (Σ − J C Jᵀ)⁻¹ Σ`` (the hat matrix of regression).
-    """
-    seen = moved.view
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LeftOut:
+    """What the other spots say of each of k spots (the hat matrix of regression: no fit is repeated)."""
+
+    #: (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``, and (k, 2, 1) residuals
+    left: FloatArray
+    residual: FloatArray
+    #: (k,) squared distance of each spot from where the others predict it, in sd
+    distance2: FloatArray
+    #: (k, 2, 2) covariance of that prediction and the spot, and its determinant
+    gate: FloatArray
+    gate_det: FloatArray
+
+    @classmethod
+    def of(cls, moved: ServoResult) -> LeftOut | None:
+        """None where a spot alone fixes a direction of the pose: the others do not predict it."""
+        own = moved.view.covariance_px
+        k = len(own)
+        J = moved.view.jacobian.reshape(k, 2, 6)
+        slack = own - J @ moved.covariance @ J.transpose(0, 2, 1)
+        if not (_det(slack) > 1e-9 * _det(own)).all() or not (slack[:, 0, 0] > 0).all():
+            return None
+        left = invert_2x2(slack)
+        r = moved.view.residual_px[:, :, None]
+        gate = own @ left @ own
+        return cls(
+            left=left, residual=r, distance2=(r.transpose(0, 2, 1) @ left @ r)[:, 0, 0], gate=gate, gate_det=_det(gate)
+        )
+
+    def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
+        """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
+        k = len(self.left)
+        C = moved.covariance
+        CJ = C @ moved.view.jacobian.reshape(k, 2, 6).transpose(0, 2, 1)  # (k, 6, 2)
+        apart = (CJ @ self.left @ self.residual)[:, :, 0]
+        C_without = C + CJ @ self.left @ CJ.transpose(0, 2, 1)
+        G = np.zeros((len(points), 3, 6))
+        G[:, :, :3] = np.eye(3)
+        G[:, :, 3:] = -skew(points @ moved.T[:3, :3].T)
+        separation = np.linalg.norm(G @ apart[:, None, :, None], axis=(2, 3))  # (k, p)
+        every = np.concatenate([C_without, C[None]])
+        variance = np.linalg.eigvalsh(G @ every[:, None] @ G.transpose(0, 2, 1))[..., -1]
+        level = math.sqrt(float(chdtri(3, risk / (k + 1)))) * np.sqrt(variance)
+        level[:-1] += separation
+        return np.asarray(level.max(axis=0))
+
+
+def _det(matrices: FloatArray) -> FloatArray:
+    determinant: FloatArray = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
+    return determinant
+
+
+def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray) -> bool:
+    """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance."""
+    if float(without.distance2.max()) > ODD_D2:
+        return True
     k = len(spots)
-    J = seen.jacobian.reshape(k, 2, 6)
-    own = seen.covariance_px
-    left = invert_2x2(own - J @ moved.covariance @ J.transpose(0, 2, 1))
-    r = seen.residual_px[:, :, None]
-    if not (left[:, 0, 0] > 0).all() or float((r.transpose(0, 2, 1) @ left @ r).max()) > ODD_D2:
-        return True
-    gate = own @ left @ own
-    det = gate[:, 0, 0] * gate[:, 1, 1] - gate[:, 0, 1] * gate[:, 1, 0]
-    if not (det > 0).all():
-        return True
     free = len(scene.xy_mm) - k
     if free:
         extent = np.ptp(scene.xy_mm, axis=0)
         density = free / float(extent[0] * extent[1])
-        if float((math.pi * ODD_D2 * np.sqrt(det) * density).max()) > CHANCE_IN_GATE:
+        if math.pi * ODD_D2 * math.sqrt(float(without.gate_det.max())) * density > CHANCE_IN_GATE:
             return True
-    predicted = scene.xy_mm[spots] - (own @ left @ r)[:, :, 0]
+    predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.left @ without.residual)[:, :, 0]
     d = scene.xy_mm - predicted[:, None]  # (k, m, 2)
-    distance2 = ((d @ invert_2x2(gate)) * d).sum(axis=-1)
+    distance2 = ((d @ invert_2x2(without.gate)) * d).sum(axis=-1)
     return int((distance2 < CONTEST_D2).sum()) > k
 
 
