@@ -21,7 +21,7 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.matching import doubt, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import Observations, ScaleFit, refine_scales
-from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, BAD_FIT_P, INFLATE_P, make_scene, register
+from ctreg_cli.registration.register import BAD_FIT_P, INFLATE_P, make_scene, register
 from ctreg_cli.registration.result import Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -36,6 +36,8 @@ _ASPECTS = (1.0, 1 / 1.08, 1.08, 1 / 1.17, 1.17, 1 / 1.26, 1.26)
 _SLACK_NOMINAL, _SLACK_GRID, _SLACK_FITTED = 0.01, 0.025, 0.004
 #: matched spots below which one slice says nothing of two scales and a pose
 _LEAST_SPOTS = 5
+#: ln odds of a match at a grid scale that make it worth a fit
+_START_LOG_ODDS = 4.0
 #: slices used to find the first scale; the others confirm it
 _FIRST_SLICES = 3
 _ROUNDS = 4
@@ -230,7 +232,7 @@ def _search_scales(
         for middle in grid:
             scale = Scale(s_x=float(middle * math.sqrt(aspect)), s_y=float(middle / math.sqrt(aspect)))
             odds = max(_odds_at(slices[p], model, scale, options) for p in first)
-            if odds > 0.5 * ACCEPT_LOG_ODDS:
+            if odds > _START_LOG_ODDS:
                 starts.append((odds, scale))
         for _, scale in sorted(starts, key=lambda x: -x[0])[:6]:
             labelled, fit = _fit_from(slices, usable, model, scale, _SLACK_GRID, options)

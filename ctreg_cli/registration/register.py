@@ -26,8 +26,11 @@ from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
 #: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed this
-#: (ln): chance is a rival like any other. False alarms measured by benchmarks/accuracy.py
-ACCEPT_LOG_ODDS = math.log(150)
+#: (ln): chance is a rival like any other ...
+ACCEPT_LOG_ODDS = math.log(100)
+#: ... and more for each spot left over: in dense clutter chance matches crowd up to what Markov's inequality allows them,
+#: among few spots they stay far below (measured by benchmarks/accuracy.py, table ``clutter``)
+ACCEPT_LOG_ODDS_PER_FREE_SPOT = 0.12
 #: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
 ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 #: a rival within these odds of the best makes the slice ambiguous (contract §5)
@@ -47,6 +50,8 @@ _WORTH_SAYING = 1e-3
 #: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
 #: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
+#: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
+_LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
 #: matches below which nothing can be checked: three spots always fit
 LEAST_MATCHES = 4
 #: spots or rods up to which a match of four is looked for
@@ -154,9 +159,10 @@ def _log_others(matches: Matches) -> float:
     return float(np.log1p(np.exp(np.minimum(others, 50)).sum()))
 
 
-def accepted_log_odds(n_matches: int) -> float:
-    """The ln odds that a match of so many spots must exceed."""
-    return ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
+def accepted_log_odds(n_matches: int, n_spots: int) -> float:
+    """The ln odds that a match of so many of the slice's spots must exceed."""
+    least = ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
+    return least + ACCEPT_LOG_ODDS_PER_FREE_SPOT * (n_spots - n_matches)
 
 
 def decide(
@@ -178,17 +184,23 @@ def decide(
 
     if len(best.rod_index) < len(best.missing_rods):
         return refused("no_consistent_match")
-    if best.log_odds < accepted_log_odds(len(best.rod_index)):
+    if best.log_odds < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     if chdtrc(best.degrees_of_freedom, best.chi2) < BAD_FIT_P:
         return refused("bad_fit")
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return refused("bad_fit")
+    if (
+        len(best.missing_rods) >= 2
+        and len(spots) - len(best.rod_index) >= 2
+        and _fits_better_loosely(model, scene, best)
+    ):
+        return refused("bad_fit")
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
     doubts = [c for c in candidates[1:] if _knows_less(c, best)]
     rivals = [c for c in candidates[1:] if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
-    if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index)):
+    if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
     widened, factor = widen_where_curved(model, scene, matches, best)
@@ -249,6 +261,21 @@ def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
     if len(p) == 0:
         return 1.0
     return float(chdtrc(2 * len(p), -2 * np.log(np.maximum(p, 1e-300)).sum()))
+
+
+def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool:
+    """Whether more spots become rods, at better odds, once the spots (or the frame) may be a few percent off.
+
+    With a wrong scale or a frame that is not its drawing the true match does not fit, and a chance match of a few of its
+    spots is what remains; it must not pass for the pose.
+    """
+    slack = (_LOOSE_SHARE * model.size_mm) ** 2
+    loose = replace(scene, covariance_mm=scene.covariance_mm + slack * np.eye(2))
+    n = len(best.rod_index)
+    matches = search(model, loose, least_matches=n + 1)
+    if matches is None:
+        return False
+    return float(matches.log_odds[0]) + _LOG_PRIOR_LOOSE > best.log_odds
 
 
 def undetermined(model: RodModel, covariance: FloatArray) -> bool:
