@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from ctreg_cli._version import __version__
-from ctreg_cli.cli import calibrate, console, export, info, model, pose, report, segment, simulate, track
+from ctreg_cli.cli import calibrate, console, export, info, model, pose, report, segment, servo, simulate, track
 from ctreg_cli.errors import CtregError, EstimationError
 
 EXIT_NOTHING_FOUND, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -91,6 +91,7 @@ app.command(short_help="Pixel scale from slices of a known frame.")(calibrate.ca
 app.command(short_help="Pose of the frame in every slice, each on its own.")(pose.pose)
 app.command(short_help="Pose of the frame through slices as one sequence in time.")(track.track)
 app.command(short_help="DICOM series of a frame with known poses.")(simulate.simulate)
+app.command(short_help="The control law alone: from one pose to the spots of another.")(servo.servo)
 app.add_typer(model.app, name="model", short_help="Frames: list, show, check.")
 app.command(short_help="Series in files and folders.")(info.info)
 app.command(short_help="Results as files of other programs.")(export.export)
