@@ -45,7 +45,10 @@ def export(
     ] = None,
     coordinates: Annotated[
         Coordinates | None,
-        typer.Option(help="Of the slice or of the patient (LPS).  [default: patient if known]", show_default=False),
+        typer.Option(
+            help="Of the slice or of the patient (LPS).  [default: patient if known; slice in .tum, .kitti]",
+            show_default=False,
+        ),
     ] = None,
     slice_number: Annotated[
         int | None,
@@ -65,7 +68,7 @@ def export(
       .tf.json    ROS tf2 transforms (m)
       .mat        MATLAB, Octave
       .parquet    column table (extra export)
-      .dcm        DICOM Spatial Registration, one slice a file (results with --with-uids)
+      .dcm        DICOM Spatial Registration, one slice a file (needs --with-uids)
 
     \b
     Examples:
@@ -84,13 +87,15 @@ def export(
     talk = Talk(quiet=quiet)
     document = read_document(results)
     frame = frame_of_results(document, model)
-    content = select(document, space=coordinates.value if coordinates else None, model=frame)
-    if any(kind.has_times for kind in formats) and not has_times(content):
+    contents = [
+        select(document, space=coordinates.value if coordinates else kind.space, model=frame) for kind in formats
+    ]
+    if any(kind.has_times for kind in formats) and not has_times(contents[0]):
         talk.warn(f"{results}: the slices have no time; their numbers stand for seconds")
-    for name in output:
+    for name, content in zip(output, contents, strict=True):
         written = write_export(name, content, index=slice_number)
         what = str(written[0]) if len(written) == 1 else f"{len(written)} files {name}"
         talk.say(f"{what}: {content.space} coordinates")
-    left_out = len(document.records) - len(content.usable)
+    left_out = len(document.records) - len(document.ok)
     if left_out:
         talk.say(f"{left_out} of {len(document.records)} slices are not ok; their poses are not exported")

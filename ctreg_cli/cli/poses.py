@@ -11,10 +11,12 @@ from ctreg_cli.cli.options import Polarity
 from ctreg_cli.cli.overlays import OverlayWriter
 from ctreg_cli.cli.run import Watched, choose_scale, close, consume, open_inputs
 from ctreg_cli.cli.summary import PoseTally
+from ctreg_cli.cli.watch_session import Session
 from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.interop.exports import ExportSink, split_outputs
 from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding, write_results
 from ctreg_cli.io.rod_file import load_rod_model
-from ctreg_cli.io.sinks import check_outputs, open_sinks
+from ctreg_cli.io.sinks import Sinks, check_outputs, open_sinks
 from ctreg_cli.pipeline import FrameResult, smoothed
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -49,6 +51,7 @@ def run_poses(
     arguments: PoseArguments,
     *,
     smooth: str | None = None,
+    session: Session | None = None,
 ) -> None:
     """Write a result for every slice, then tell how it went.
 
@@ -58,17 +61,22 @@ def run_poses(
         options: its options as resolved, for the record.
         arguments: the rest of the command line.
         smooth: where the trajectory smoothed in hindsight goes, if anywhere; all results are then kept until the end.
+        session: where slices come from and results go beside files, if anywhere.
 
     Raises:
         CtregError: the model, the input, the scale or an output cannot be used.
         typer.Exit: code 1 when not one slice gave a pose, or with ``strict`` when any slice is not ``ok``.
     """
-    outputs = check_outputs(arguments.output, arguments.inputs)
+    session = session or Session()
+    tables, exports = split_outputs(arguments.output)
+    outputs = [] if exports and not tables else check_outputs(tables, arguments.inputs)
     if smooth is not None:
         check_outputs([*outputs, smooth], arguments.inputs)
     talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose, outputs=outputs)
     model = load_rod_model(arguments.model)
-    source = open_inputs(arguments.inputs, talk, series=arguments.series, spot_sd_px=arguments.spot_sd)
+    source = session.source
+    if source is None:
+        source = open_inputs(arguments.inputs, talk, series=arguments.series, spot_sd_px=arguments.spot_sd)
     scale = choose_scale(arguments.scale, arguments.calibration, source, model, talk)
     segmentation = SegmentationOptions(polarity=arguments.polarity.value)
     overlays = None
@@ -80,7 +88,11 @@ def run_poses(
         scale_from=scale.origin,
         options={"command": command, **options, "segmentation": asdict(segmentation)},
     )
-    sinks = open_sinks(outputs, results_encoding(header, with_uids=arguments.with_uids), sys.stdout)
+    more = [ExportSink(output, header, one_slice=len(source) == 1, tell=talk.warn) for output in exports]
+    encoding = results_encoding(header, with_uids=arguments.with_uids)
+    sinks = open_sinks(outputs, encoding, sys.stdout) if outputs else Sinks[FrameResult]([])
+    for sink in (*session.sinks, *more):
+        sinks.add(sink)
     kept: list[FrameResult] = []
     watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
 
@@ -100,13 +112,13 @@ def run_poses(
 
     results = estimate(watched, model, scale.scale, segmentation)
     try:
-        consume(results, sinks, on_result, talk, total=len(source), what=command)
+        consume(results, sinks, on_result, talk, total=len(source) or None, what=command)
     except KeyboardInterrupt:
-        talk.table(tally.rows())
+        talk.table([*tally.rows(), *session.rows()])
         raise
     if smooth is not None:
         write_results(smoothed(kept, model, scale=scale.scale), smooth, header, with_uids=arguments.with_uids)
-    talk.table(tally.rows())
+    talk.table([*tally.rows(), *session.rows()])
     close(n_good=tally.n_poses, n_failed=tally.total - tally.n_ok, strict=arguments.strict)
 
 

@@ -128,7 +128,7 @@ def consume(
     on_result: Callable[[Result], None],
     talk: Talk,
     *,
-    total: int,
+    total: int | None,
     what: str,
 ) -> None:
     """Pass every result on; stop early only when nobody reads any more (``| head``).
@@ -145,7 +145,8 @@ def consume(
                 if not sinks.alive:
                     return
     except KeyboardInterrupt:
-        talk.say(f"interrupted: {done} of {total} slices are written")
+        of_total = f" of {total}" if total else ""
+        talk.say(f"interrupted: {done}{of_total} slices are written")
         raise
 
 

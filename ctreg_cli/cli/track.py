@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from ctreg_cli.cli import options as opt
+from ctreg_cli.cli import watch_options as live
 
 
 class Prediction(StrEnum):
@@ -32,8 +33,8 @@ SmoothFile = Annotated[
 
 
 def track(
-    inputs: opt.Inputs,
     model: opt.ModelName,
+    inputs: live.OptionalInputs = None,
     calibration: opt.CalibrationFile = None,
     scale: opt.ScalePair = None,
     output: opt.Outputs = None,
@@ -41,6 +42,10 @@ def track(
     gain: opt.Gain = opt.TRACKING.gain,
     prediction: PredictionChoice = Prediction.velocity,
     smooth: SmoothFile = None,
+    watch: live.WatchFolder = None,
+    idle: live.Idle = None,
+    count: live.Count = None,
+    igtl: live.Igtl = None,
     use_mount: opt.UseMount = opt.REGISTRATION.use_mount,
     integrity_risk: opt.IntegrityRisk = opt.REGISTRATION.integrity_risk,
     alert_limit: opt.AlertLimit = opt.REGISTRATION.alert_limit_mm,
@@ -62,26 +67,29 @@ def track(
     Examples:
       ctreg track slices/ -m frame.yaml -o track.csv
       ctreg track slices/ -m frame.yaml --jacobian constant -o track.jsonl
-      ctreg track slices/ -m frame.yaml -o track.csv -o track.tum --smooth smooth.csv
+      ctreg track slices/ -m frame.yaml -o track.tum --smooth smooth.csv
+      ctreg track --watch incoming/ -m frame.yaml --igtl 18944 -o track.jsonl
     """
     from dataclasses import asdict
 
     from ctreg_cli import pipeline
     from ctreg_cli.cli.poses import PoseArguments, run_poses
+    from ctreg_cli.cli.watch_session import open_session, track_live
     from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 
     registration = RegistrationOptions(use_mount=use_mount, integrity_risk=integrity_risk, alert_limit_mm=alert_limit)
     tracking = TrackingOptions(
         registration=registration, jacobian=jacobian.value, gain=gain, prediction=prediction.value
     )
+    session = open_session(inputs or [], watch=watch, idle=idle, count=count, igtl=igtl)
     run_poses(
         "track",
-        lambda slices, frame, mm_per_px, segmentation: pipeline.track(
+        lambda slices, frame, mm_per_px, segmentation: (track_live if watch else pipeline.track)(
             slices, frame, scale=mm_per_px, options=tracking, segmentation=segmentation
         ),
         {"tracking": asdict(tracking)},
         PoseArguments(
-            inputs=inputs,
+            inputs=inputs or [],
             model=model,
             calibration=calibration,
             scale=scale,
@@ -96,4 +104,5 @@ def track(
             verbose=verbose,
         ),
         smooth=smooth,
+        session=session,
     )

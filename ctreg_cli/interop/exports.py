@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ctreg_cli.errors import InputError
 from ctreg_cli.interop import itk, slicer, spatial_registration, tables, trajectories
-from ctreg_cli.interop.selection import Content
+from ctreg_cli.interop.selection import Content, Space, select
+from ctreg_cli.io import sinks
 from ctreg_cli.io.atomic import check_folder, write_bytes
-from ctreg_cli.io.results_document import SliceRecord
+from ctreg_cli.io.results import ResultsHeader
+from ctreg_cli.io.results_document import SliceRecord, document_of, record_of
+from ctreg_cli.pipeline import FrameResult
 
 #: stands in a file name for the number of the slice
 SLICE = "{slice}"
@@ -27,6 +30,8 @@ class Format:
     needs_model: bool = False
     #: seconds are written; the slice's number stands for them where there are none
     has_times: bool = False
+    #: without a word from the user: the coordinates of the pose table, or the patient's where they are known
+    space: Space | None = None
 
 
 #: suffix → format; the longest suffix that fits counts
@@ -38,8 +43,10 @@ FORMATS: Mapping[str, Format] = {
         needs_model=True,
     ),
     ".seq.mha": Format(meaning="3D Slicer transform sequence", all_slices=slicer.transform_sequence, has_times=True),
-    ".tum": Format(meaning="trajectory, time and quaternion (m)", all_slices=trajectories.tum, has_times=True),
-    ".kitti": Format(meaning="trajectory, matrices (m)", all_slices=trajectories.kitti),
+    ".tum": Format(
+        meaning="trajectory, time and quaternion (m)", all_slices=trajectories.tum, has_times=True, space="slice"
+    ),
+    ".kitti": Format(meaning="trajectory, matrices (m)", all_slices=trajectories.kitti, space="slice"),
     ".tf.json": Format(meaning="ROS tf2 transforms (m)", all_slices=trajectories.tf_json, has_times=True),
     ".mat": Format(meaning="MATLAB", all_slices=tables.mat),
     ".parquet": Format(meaning="column table", all_slices=tables.parquet),
@@ -118,3 +125,48 @@ def write_export(output: str, content: Content, *, index: int | None = None) -> 
         write_bytes(path, data)
         written.append(path)
     return written
+
+
+class ExportSink:
+    """One ``-o`` of another program's format, as an output of results (see :class:`ctreg_cli.io.sinks.Sink`).
+
+    The file is made from all results when they are done; when none may be used there is none, and ``tell`` hears of it.
+
+    Raises:
+        InputError: as :func:`check_export`, or the format wants one file a slice and the name does not.
+    """
+
+    def __init__(self, output: str, header: ResultsHeader, *, one_slice: bool, tell: Callable[[str], None]) -> None:
+        self._output, self._header, self._tell = output, header, tell
+        self._kind = check_export(output)
+        if self._kind.one_slice is not None and not one_slice and SLICE not in output:
+            raise InputError(
+                f"-o {output}: such a file holds one slice; put {SLICE} in its name to write one file each"
+            )
+        self._records: list[SliceRecord] = []
+
+    def write(self, result: FrameResult) -> None:
+        """Keep what the file will say of a slice."""
+        self._records.append(record_of(result, self._header, with_uids=self._kind.needs_uids))
+
+    def finish(self) -> None:
+        """Write the file or files."""
+        document = document_of(self._header, self._records)
+        if not document.ok:
+            self._tell(f"-o {self._output}: not one pose of status ok, so nothing is written")
+            return
+        write_export(self._output, select(document, space=self._kind.space, model=self._header.model))
+
+    def abandon(self) -> None:
+        """Nothing has been written."""
+        self._records.clear()
+
+
+def split_outputs(outputs: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """The values of ``-o``: those that :mod:`ctreg_cli.io.sinks` writes, and those that are written here."""
+    exports = [
+        output
+        for output in outputs or ()
+        if (kind := format_of(output)) is not None and not any(FORMATS.get(s) is kind for s in sinks.FORMATS)
+    ]
+    return [output for output in outputs or () if output not in exports], exports

@@ -1,0 +1,108 @@
+"""What a command does beside files: slices from a folder that fills or from the network, results to OpenIGTLink."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ctreg_cli.cli.console import counted
+from ctreg_cli.cli.run import Watched
+from ctreg_cli.errors import InputError
+from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.io.sinks import Sink
+from ctreg_cli.io.sources import Source
+from ctreg_cli.pipeline import FrameResult, SliceLike
+from ctreg_cli.registration.options import TrackingOptions
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+
+
+@dataclass(slots=True)
+class Arriving:
+    """Slices whose number nobody knows yet."""
+
+    slices: Iterable[SliceLike]
+
+    def __len__(self) -> int:
+        """0: not known."""
+        return 0
+
+    def __iter__(self) -> Iterator[SliceLike]:
+        return iter(self.slices)
+
+
+def track_live(
+    slices: Watched,
+    model: RodModel,
+    *,
+    scale: Scale | None,
+    options: TrackingOptions,
+    segmentation: SegmentationOptions,
+) -> Iterator[FrameResult]:
+    """See :func:`ctreg_cli.interop.live.track_live`; what goes wrong inside is told as a warning."""
+    from ctreg_cli.interop import live
+
+    return live.track_live(
+        slices, model, scale=scale, options=options, segmentation=segmentation, on_fault=slices.talk.warn
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Session:
+    """Where slices come from, None: the inputs; and where results go beside files."""
+
+    source: Source | None = None
+    sinks: Sequence[Sink[FrameResult]] = ()
+    #: lines for the closing table
+    remarks: Sequence[Callable[[], list[tuple[str, str]]]] = field(default=())
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Names and values for the closing table."""
+        return [row for remark in self.remarks for row in remark()]
+
+
+def open_session(
+    inputs: Sequence[str], *, watch: str | None, idle: float | None, count: int | None, igtl: str | None
+) -> Session:
+    """What ``--watch`` and ``--igtl`` ask for.
+
+    Raises:
+        InputError: inputs and a folder to watch, or neither; a folder or an address that cannot be used.
+    """
+    if watch is None and (idle is not None or count is not None):
+        raise InputError("--idle and --count go with --watch DIR")
+    if watch is not None and inputs:
+        raise InputError(f"--watch {watch}: takes no INPUT ({inputs[0]}); what is in the folder already comes first")
+    if watch is None and not inputs:
+        raise InputError("name the slices: INPUT..., or --watch DIR")
+    source, sinks, remarks = None, [], []
+    if watch is not None:
+        from ctreg_cli.io.watch import WatchedFolder, WatchOptions
+
+        folder = WatchedFolder(Path(watch), WatchOptions(idle_s=idle, count=count))
+        source = Source(slices=Arriving(folder), kind="images")
+        remarks.append(lambda: [("skipped", counted(folder.skipped))] if folder.skipped else [])
+    if igtl is not None:
+        sink, remark = open_igtl(igtl)
+        sinks.append(sink)
+        remarks.append(remark)
+    return Session(source=source, sinks=sinks, remarks=remarks)
+
+
+def open_igtl(address: str) -> tuple[Sink[FrameResult], Callable[[], list[tuple[str, str]]]]:
+    """The server of ``--igtl`` as an output, and what the closing table says of it.
+
+    Raises:
+        InputError: it is no address, or cannot be listened on.
+    """
+    from ctreg_cli.interop.igtl_server import IgtlServer, parse_address
+
+    server = IgtlServer(*parse_address(address))
+
+    def remark() -> list[tuple[str, str]]:
+        counts = {"slices dropped for slow clients": server.dropped, "clients refused": server.refused}
+        lost = {what: count for what, count in counts.items() if count}
+        return [("OpenIGTLink", counted(lost))] if lost else []
+
+    return server, remark

@@ -1,0 +1,58 @@
+"""The method beside a scanner: a slice that cannot be worked on is a row, never the end of the session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+from ctreg_cli.errors import MissingScaleError
+from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.imaging.slice import UnreadableSlice
+from ctreg_cli.imaging.spot_slice import SpotSlice
+from ctreg_cli.pipeline import FrameResult, SliceLike, failure, no_spots, track_slice
+from ctreg_cli.registration.options import TrackingOptions
+from ctreg_cli.rods import RodModel
+from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.tracker import Tracker
+
+
+def track_live(
+    slices: Iterable[SliceLike],
+    model: RodModel,
+    *,
+    scale: Scale | None = None,
+    options: TrackingOptions | None = None,
+    segmentation: SegmentationOptions | None = None,
+    on_fault: Callable[[str], None] = lambda text: None,
+) -> Iterator[FrameResult]:
+    """As :func:`ctreg_cli.pipeline.track`, but nothing that one slice brings about ends it.
+
+    A slice without a scale is ``no_pose``/``no_scale``. One on which the method itself breaks is
+    ``no_pose``/``internal_error``; the frame is then looked for anew in the next.
+
+    Args:
+        slices: as they come.
+        model: the rods.
+        scale: mm per pixel for all slices; None: each slice's own.
+        options: see :class:`TrackingOptions`.
+        segmentation: see :class:`SegmentationOptions`.
+        on_fault: told, in a sentence, what went wrong inside.
+    """
+    segmentation = segmentation or SegmentationOptions()
+    tracker = Tracker(model, options)
+    for place, slice_ in enumerate(slices):
+        try:
+            result = track_slice(place, slice_, tracker, scale=scale, segmentation=segmentation)
+        except MissingScaleError as error:
+            on_fault(str(error))
+            result = failure(place, _without_spots(slice_), "no_scale")
+        # the scanner does not wait: whatever breaks here is told, and the next slice starts afresh
+        except Exception as error:  # noqa: BLE001
+            on_fault(f"{slice_.info.source}: {type(error).__name__} inside ctreg; the frame is looked for anew")
+            tracker = Tracker(model, options)
+            result = failure(place, _without_spots(slice_), "internal_error")
+        yield result
+
+
+def _without_spots(slice_: SliceLike) -> SpotSlice:
+    problem = slice_.problem if isinstance(slice_, UnreadableSlice) else ""
+    return SpotSlice(info=slice_.info, spots=no_spots(), problem=problem)
