@@ -19,6 +19,7 @@ from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots, meas
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.joint import register_joint
 from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
@@ -54,7 +55,7 @@ class FrameResult:
     spots: Spots
     status: Status
     reason: str
-    #: ``registered`` | ``updated`` | ``constant`` | ``reacquired``; empty without a pose
+    #: ``registered`` | ``joint`` | ``updated`` | ``constant`` | ``reacquired``; empty without a pose
     method: str
     candidates: tuple[Candidate, ...] = ()
     targets: tuple[TargetAccuracy, ...] = ()
@@ -145,6 +146,39 @@ def register_slice(
         options=options,
     )
     return frame_result(index, item, model, registration, method="registered")
+
+
+def pose_joint(
+    slices: Iterable[SliceLike],
+    model: RodModel,
+    *,
+    scale: Scale | None = None,
+    options: RegistrationOptions | None = None,
+    segmentation: SegmentationOptions | None = None,
+) -> Iterator[FrameResult]:
+    """One rigid pose for all slices of a scan, carried into each by its DICOM geometry; a scan is a series.
+
+    All slices are read before the first result comes.
+
+    Args:
+        slices: images or spots whose places in the patient are known.
+        model: the rods.
+        scale: mm per pixel for all slices; None: each slice's own.
+        options: see :class:`RegistrationOptions`.
+        segmentation: see :class:`SegmentationOptions`.
+
+    Raises:
+        InputError: no slice of a series has a place in the patient.
+        MissingScaleError: no slice of a series has a scale, and none was given.
+    """
+    items = list(segment(slices, segmentation or SegmentationOptions()))
+    rows: dict[int, Registration] = {}
+    for series in dict.fromkeys(item.info.series for item in items):
+        places = [place for place, item in enumerate(items) if item.info.series == series]
+        joint = register_joint([items[place] for place in places], model, scale=scale, options=options)
+        rows.update(zip(places, joint.slices, strict=True))
+    for place, item in enumerate(items):
+        yield frame_result(place if item.index is None else item.index, item, model, rows[place], method="joint")
 
 
 def track(

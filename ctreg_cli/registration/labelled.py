@@ -82,7 +82,12 @@ def register_labelled(
     found = _distinct(part, [candidate for candidate in found if _cuts_its_rods(part, candidate)])
     if found and all(_condition(part, candidate) > _SINGULAR_CONDITION for candidate in found):
         raise SingularGeometryError("these spots leave the pose undetermined: there is a direction that moves none")
-    return [_in_the_whole_frame(model, rods, chosen, candidate) for candidate in found]
+    whole = []
+    for candidate in found:
+        used = scale or candidate.scale
+        assert used is not None  # one or the other
+        whole.append(_in_the_whole_frame(model, rods, chosen, candidate, used))
+    return whole
 
 
 def _checked(spots: Spots, rod_index: Sequence[int] | IntArray, model: RodModel) -> tuple[IntArray, IntArray]:
@@ -228,14 +233,18 @@ def _condition(model: RodModel, candidate: Candidate) -> float:
     return math.sqrt(float(variance[-1]) / max(float(variance[0]), 1e-300))
 
 
-def _in_the_whole_frame(model: RodModel, rods: IntArray, chosen: IntArray, candidate: Candidate) -> Candidate:
+def _in_the_whole_frame(
+    model: RodModel, rods: IntArray, chosen: IntArray, candidate: Candidate, scale: Scale
+) -> Candidate:
     """The candidate with rods and spots numbered as the caller's are, and the rods that should have been seen too."""
     projection = project(candidate.T_slice_model, model.starts, model.directions)
     unseen = within_bounds(projection.lambda_mm, model.lengths)
     unseen[rods] = False
+    missing = np.nonzero(unseen)[0]
     return replace(
         candidate,
         rod_index=frozen_index(rods),
         spot_index=frozen_index(chosen),
-        missing_rods=frozen_index(np.nonzero(unseen)[0]),
+        missing_rods=frozen_index(missing),
+        missing_px=frozen(projection.xy_mm[missing] / scale.mm_per_px, (None, 2)),
     )

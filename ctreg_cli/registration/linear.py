@@ -1,8 +1,9 @@
 """Labelled spots to poses by linear algebra (Doignon et al. 2008, §2, eq. 4–6).
 
-The spot ``(u, v)`` in model coordinates is ``X = l1 u + l2 v + c`` with ``l1 = s_x r1``, ``l2 = s_y r2``, ``c = −Rᵀ t``, where
-r1 and r2 are the first two rows of R. It lies on its rod, ``X × y = w``: of these three equations a rod two are independent,
-the components of ``X − p`` across the rod, and those are the rows used. What closes the system depends on its rank:
+The spot ``(u, v)`` in model coordinates is ``X = l1 u + l2 v + c`` with ``l1 = s_x r1``, ``l2 = s_y r2`` and
+``c = −Rᵀ t``, where r1 and r2 are the first two rows of R. It lies on its rod, ``X × y = w``: of these three equations
+a rod two are independent, the components of ``X − p`` across the rod, and those are the rows used. What closes
+the system depends on its rank:
 
 ==========  =====================================  ==========================================================
 rank of 9   scales known                           scales unknown
@@ -12,12 +13,14 @@ rank of 9   scales known                           scales unknown
 less        three rods at a time (``minimal``)     undetermined
 ==========  =====================================  ==========================================================
 
-Four generic rods give rank 8, but so do six rods of a two-panel Leksell box at every pose: the rank is judged on the
-singular values, never on the number of rods. Noise lifts a singular value that is truly zero, so that it counts as zero up
-to what noise alone would make of it; between certainly zero and certainly not, the answers of both branches are returned.
+Four generic rods give rank 8, but so do six rods of a two-panel Leksell box at every pose: the rank is judged on
+the singular values, never on the number of rods. Noise lifts a singular value that is truly zero, so that it
+counts as zero up to what noise alone would make of it; between certainly zero and certainly not, the answers of
+both branches are returned.
 
-A slice seen from behind (mirrored pixels) is a proper pose too, turned over; a mirrored *frame* is never returned, for
-``r3 = r1 × r2``. The answers are exact for exact spots and only starting points for noisy ones (method §3).
+A slice seen from behind (mirrored pixels) is a proper pose too, turned over; a mirrored *frame* is never
+returned, for ``r3 = r1 × r2``. The answers are exact for exact spots and only starting points for noisy ones
+(method §3).
 """
 
 from __future__ import annotations
@@ -36,10 +39,10 @@ from ctreg_cli.rods import RodModel
 
 #: a singular value below this share of the greatest is rounding
 RANK_TOLERANCE = 1e-9
-#: noise of relative size ε lifts a vanishing singular value to about ε times the greatest; up to so many times: perhaps
+#: noise of relative size ε lifts a vanishing singular value to about ε times the greatest; up to so many times: maybe
 _NOISE_FACTOR = 4.0
-#: rods whose directions spread less than this (sine), or whose ends leave their plane by less than this share of the
-#: frame's size, count as parallel or coplanar
+#: rods whose directions spread less than this (sine), or whose ends leave their plane by less than this share of
+#: the frame's size, count as parallel or coplanar
 _DEGENERATE = 1e-6
 #: rod triples tried where the linear system has rank below 8
 _MOST_TRIPLES = 24
@@ -102,8 +105,8 @@ def solve_labelled(
         noise_px: standard deviation of the spots; only judges the rank and lets nearly real roots pass.
 
     Raises:
-        SingularGeometryError: fewer than three rods (four with unknown scales), parallel or coplanar rods, spots in one
-            point, or unknown scales and a system of rank below 8.
+        SingularGeometryError: fewer than three rods (four with unknown scales), parallel or coplanar rods,
+            spots in one point, or unknown scales and a system of rank below 8.
     """
     uv_px = np.asarray(uv_px, dtype=np.float64)
     check_geometry(model, 3 if mm_per_px is not None else 4)
@@ -157,8 +160,9 @@ def check_geometry(model: RodModel, least: int) -> None:
 def _close(system: _System, base: FloatArray, null: FloatArray, mm_per_px: FloatArray | None) -> FloatArray:
     """The members (r, 9) of the family ``base + a null`` that are poses: eq. |l1| = s_x, |l2| = s_y, l1·l2 = 0.
 
-    With known scales these are three quadratics in one unknown, which noise keeps from agreeing: every local minimum of
-    the sum of their squares (a quartic) is taken. With unknown scales only the last remains, and both its roots are.
+    With known scales these are three quadratics in one unknown, which noise keeps from agreeing: every local
+    minimum of the sum of their squares (a quartic) is taken. With unknown scales only the last remains, and both
+    its roots are.
     """
     k1, k2, _ = system.columns(base)
     g1, g2, _ = system.columns(null)
