@@ -18,7 +18,7 @@ from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import CalibrationError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import doubt, search
+from ctreg_cli.registration.matching import search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import Observations, ScaleFit, refine_scales
 from ctreg_cli.registration.register import BAD_FIT_P, INFLATE_P, make_scene, register
@@ -38,8 +38,8 @@ _SLACK_NOMINAL, _SLACK_GRID, _SLACK_FITTED = 0.01, 0.025, 0.004
 _LEAST_SPOTS = 5
 #: ln odds of a match at a grid scale that make it worth a fit
 _START_LOG_ODDS = 4.0
-#: slices used to find the first scale; the others confirm it
-_FIRST_SLICES = 3
+#: starting scales that are fitted, the best first
+_MOST_STARTS = 3
 _ROUNDS = 4
 
 
@@ -220,21 +220,28 @@ def fit_scales(slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model
 def _search_scales(
     slices: Sequence[SpotSlice], usable: list[int], model: RodModel, options: RegistrationOptions
 ) -> tuple[list[_Labelled], ScaleFit | None]:
-    """Walk the grid of scales on a few slices; the scale that explains most, confirmed on all slices, wins."""
+    """Walk the grid of scales on one slice; the scale that explains most, confirmed on all slices, wins.
+
+    Nearly all rods seen is the quick and likely case and is tried for every aspect ratio first; a match of few of them is
+    looked for with square pixels only.
+    """
     # most spots of the frame and least clutter: near the frame's own number of rods
-    first = sorted(usable, key=lambda p: abs(len(slices[p].spots) - len(model)))[:_FIRST_SLICES]
+    first = slices[min(usable, key=lambda p: abs(len(slices[p].spots) - len(model)))]
+    whole = min(len(first.spots), len(model))
     low, high = SCALE_RANGE
-    steps = int(math.ceil(math.log(high / low) / math.log(_GRID_STEP)))
-    grid = np.geomspace(low, high, steps + 1)
-    best: tuple[float, list[_Labelled], ScaleFit] | None = None
-    for aspect in _ASPECTS:
+    grid = np.geomspace(low, high, int(math.ceil(math.log(high / low) / math.log(_GRID_STEP))) + 1)
+    tries = [(max(whole - 1, _LEAST_SPOTS), aspect) for aspect in _ASPECTS]
+    if whole - 1 > _LEAST_SPOTS:
+        tries.append((_LEAST_SPOTS, 1.0))
+    for least, aspect in tries:
         starts: list[tuple[float, Scale]] = []
         for middle in grid:
             scale = Scale(s_x=float(middle * math.sqrt(aspect)), s_y=float(middle / math.sqrt(aspect)))
-            odds = max(_odds_at(slices[p], model, scale, options) for p in first)
+            odds = _odds_at(first, model, scale, options, least)
             if odds > _START_LOG_ODDS:
                 starts.append((odds, scale))
-        for _, scale in sorted(starts, key=lambda x: -x[0])[:6]:
+        best: tuple[float, list[_Labelled], ScaleFit] | None = None
+        for _, scale in sorted(starts, key=lambda x: -x[0])[:_MOST_STARTS]:
             labelled, fit = _fit_from(slices, usable, model, scale, _SLACK_GRID, options)
             if fit is None:
                 continue
@@ -242,11 +249,13 @@ def _search_scales(
             if best is None or worth > best[0] + 1e-6:
                 best = (worth, labelled, fit)
         if best is not None:
-            break
-    return ([], None) if best is None else best[1:]
+            return best[1:]
+    return [], None
 
 
-def _odds_at(item: SpotSlice, model: RodModel, scale: Scale, options: RegistrationOptions) -> float:
+def _odds_at(
+    item: SpotSlice, model: RodModel, scale: Scale, options: RegistrationOptions, least_matches: int
+) -> float:
     """ln odds of the best match of one slice at a grid scale."""
     scene = make_scene(
         _loosened(item.spots, model, scale, _SLACK_GRID),
@@ -257,10 +266,8 @@ def _odds_at(item: SpotSlice, model: RodModel, scale: Scale, options: Registrati
         shape=item.info.shape,
         options=options,
     )
-    matches = search(model, scene, least_matches=_LEAST_SPOTS)
-    if matches is None:
-        return -math.inf
-    return float(doubt(model, scene, matches, least_matches=_LEAST_SPOTS, most=1).log_odds[0])
+    matches = search(model, scene, least_matches=least_matches)
+    return -math.inf if matches is None else float(matches.log_odds[0])
 
 
 def _report(
