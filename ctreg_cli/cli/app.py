@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from ctreg_cli._version import __version__
-from ctreg_cli.cli import calibrate, console, export, info, model, pose, report, segment, servo, simulate, track
+from ctreg_cli.cli import calibrate, console, export, info, listen, model, pose, report, segment, servo, simulate, track
 from ctreg_cli.errors import CtregError, EstimationError
 
 EXIT_NOTHING_FOUND, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -94,6 +94,7 @@ app.command(short_help="DICOM series of a frame with known poses.")(simulate.sim
 app.command(short_help="The control law alone: from one pose to the spots of another.")(servo.servo)
 app.add_typer(model.app, name="model", short_help="Frames: list, show, check.")
 app.command(short_help="Series in files and folders.")(info.info)
+app.command(short_help="Slices straight from a scanner or PACS.")(listen.listen)
 app.command(short_help="Results as files of other programs.")(export.export)
 app.command(short_help="Results as a page to look at, and as figures.")(report.report)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ctreg_cli.cli.console import counted
+from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.cli.run import Watched
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
@@ -16,6 +18,9 @@ from ctreg_cli.pipeline import FrameResult, SliceLike
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+
+if TYPE_CHECKING:
+    from ctreg_cli.interop.dicom_listener import ListenOptions
 
 
 @dataclass(slots=True)
@@ -106,3 +111,38 @@ def open_igtl(address: str) -> tuple[Sink[FrameResult], Callable[[], list[tuple[
         return [("OpenIGTLink", counted(lost))] if lost else []
 
     return server, remark
+
+
+@contextmanager
+def listening(options: ListenOptions, *, igtl: str | None, quiet: bool) -> Iterator[Session]:
+    """Listen for slices for as long as the block lasts.
+
+    Raises:
+        InputError: what is asked for cannot be had.
+    """
+    from ctreg_cli.interop.dicom_listener import DicomListener
+
+    talk = Talk(quiet=quiet)
+    sinks, remarks = [], []
+    if igtl is not None:
+        sink, remark = open_igtl(igtl)
+        sinks.append(sink)
+        remarks.append(remark)
+    with DicomListener(options) as listener:
+
+        def left_out() -> list[tuple[str, str]]:
+            counts = dict(listener.left_out)
+            if options.policy == "latest" and listener.slices.dropped:
+                counts["dropped for newer ones"] = listener.slices.dropped
+            return [("not tracked", counted(counts))] if counts else []
+
+        tls = " with TLS" if options.tls_certificate else ""
+        talk.say(f"listening as {options.ae_title} on {options.host}, port {listener.port}{tls}")
+        if (
+            not options.host.startswith("127.")
+            and options.host != "::1"
+            and not (options.tls_authority or options.allowed)
+        ):
+            talk.warn("anyone who reaches this address may send; name who may with --allow, or with --tls-ca")
+        source = Source(slices=Arriving(listener.slices), kind="images")
+        yield Session(source=source, sinks=sinks, remarks=[*remarks, left_out])

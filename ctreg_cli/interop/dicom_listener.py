@@ -132,7 +132,6 @@ class DicomListener:
         self._server.shutdown()
         for association in self._server.active_associations:
             association.abort()
-        self._server.server_close()
         self._thread.join(5)
         self._scratch.cleanup()
 

@@ -12,7 +12,12 @@ import ssl
 import time
 from typing import Any
 
-from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
+from pynetdicom.transport import (
+    AssociationServer,
+    AssociationSocket,
+    RequestHandler,
+    ThreadedAssociationServer,
+)
 
 #: of requests for associations; longer ones name more than anyone needs
 MAX_CONTROL_PDU_BYTES = 1 << 20
@@ -71,6 +76,7 @@ class _Handler(RequestHandler):
         association = super()._create_association()
         # "connected" was said by the socket that goes; the one that takes its place says it again
         association.dul.event_queue.get_nowait()
+        association.dul.socket = None
         limited: type[GuardedSocket] = self.server.socket_class  # type: ignore[attr-defined]
         association.set_socket(limited(association, client_socket=self.request))
         return association
@@ -115,6 +121,14 @@ class GuardedServer(ThreadedAssociationServer):
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Whether there is room for another thread."""
         return len(self.active_associations) < self.ae.maximum_associations + SPARE_CONNECTIONS
+
+    def service_actions(self) -> None:
+        """Nothing: the full garbage collection that would be here takes longer than a slice may."""
+
+    def shutdown(self) -> None:
+        """Stop accepting, and close."""
+        super(AssociationServer, self).shutdown()
+        self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that fails at once is closed, and that is all."""
