@@ -24,7 +24,7 @@ from ctreg_cli.geometry.motion_field import motion_field
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import Scene, doubt, join, nearest_assignment, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, doubt, join, nearest_assignment, search, weigh
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.registration.register import LEAST_MATCHES, decide, make_scene
 from ctreg_cli.registration.result import Candidate, Registration
@@ -33,6 +33,7 @@ from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.prior import PastPrior
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.variants import covering, with_other_rods
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -45,6 +46,8 @@ LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 _ASSIGNMENTS = 3
 #: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
+#: spots or rods up to which a match of four is looked for
+_FEW = 6
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
 
@@ -307,12 +310,26 @@ class Tracker:
         matches = weigh(self.model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES)
         if matches is None:
             return None
-        matches = doubt(self.model, scene, matches, least_matches=LEAST_MATCHES)
-        matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
-        verdict = decide(self.model, scene, spots, scale, matches, self.options.registration)
+        verdict = self._decided(self._rivals(matches, scene, LEAST_MATCHES), prediction, scene, spots, scale)
         if verdict.status != "ok" or not continues(verdict.candidates[0], prediction):
             return None
         return self._straight(verdict, prediction, scene)
+
+    def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
+        """Matches and all that could be said instead of the best of them."""
+        matches = with_other_rods(self.model, scene, matches, least_matches)
+        return doubt(self.model, scene, matches, least_matches=least_matches)
+
+    def _decided(
+        self, matches: Matches, prediction: Prediction | None, scene: Scene, spots: Spots, scale: Scale
+    ) -> Registration:
+        """The verdict on matches weighed with what the past says."""
+        if prediction is not None:
+            matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
+        verdict = decide(self.model, scene, spots, scale, matches, self.options.registration)
+        if verdict.status != "ok":
+            return verdict
+        return replace(verdict, candidates=(covering(self.model, matches, verdict.candidates[0]),))
 
     def _straight(self, verdict: Registration, prediction: Prediction, scene: Scene) -> Registration:
         """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``."""
@@ -335,19 +352,18 @@ class Tracker:
     ) -> Tracked:
         """Register a slice from all its spots, without labels; the past is a prior on the pose."""
         model = self.model
-        pool = [] if len(spots) < LEAST_MATCHES else [search(model, scene, least_matches=LEAST_MATCHES)]
+        # a match of four among many spots could never be believed: do not look for it
+        least = LEAST_MATCHES if min(len(spots), len(model)) <= _FEW else CHECKABLE_MATCHES
+        pool = [] if len(spots) < least else [search(model, scene, least_matches=least)]
         if followed is not None:
-            pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES))
+            pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], least))
         found = [matches for matches in pool if matches is not None]
         if found:
-            matches = doubt(model, scene, join(found), least_matches=LEAST_MATCHES)
-            weighed = matches
-            if prediction is not None:
-                weighed = PastPrior.of(model, scene, prediction).applied(model, scene, matches)
-            verdict = decide(model, scene, spots, scale, weighed, self.options.registration)
+            matches = self._rivals(join(found), scene, least)
+            verdict = self._decided(matches, prediction, scene, spots, scale)
             if prediction is not None and verdict.status == "no_pose":
                 # nothing where the past expects it: the past is wrong, and the slice stands on its own
-                verdict = decide(model, scene, spots, scale, matches, self.options.registration)
+                verdict = self._decided(matches, None, scene, spots, scale)
         else:
             reason = "no_consistent_match" if pool else "too_few_spots"
             verdict = Registration(status="no_pose", reason=reason, n_spots=len(spots))

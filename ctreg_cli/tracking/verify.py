@@ -37,7 +37,7 @@ ODD_D2 = 12.5
 #: a second spot within this of where the others predict a rod's could be the rod's
 CONTEST_D2 = 25.0
 #: expected number of false spots within a rod's gate above which the spot there is not taken for granted
-CHANCE_IN_GATE = 0.02
+CHANCE_IN_GATE = 0.003
 #: a prediction or a pose known worse than this (sd of the worst turn, rad) does not exclude a twin, or is not linear
 VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
 #: steps to the pose most probable with the past; how far it may lie from the one without (χ² of six degrees of freedom)
