@@ -92,7 +92,7 @@ app.command(short_help="Pose of the frame in every slice, each on its own.")(pos
 app.command(short_help="Pose of the frame through slices as one sequence in time.")(track.track)
 app.command(short_help="DICOM series of a frame with known poses.")(simulate.simulate)
 app.command(short_help="The control law alone: from one pose to the spots of another.")(servo.servo)
-app.add_typer(model.app, name="model", short_help="Frames: list, show, check.")
+app.add_typer(model.app, name="model", short_help="Frames: list, show, check, refine.")
 app.command(short_help="Series in files and folders.")(info.info)
 app.command(short_help="Slices straight from a scanner or PACS.")(listen.listen)
 app.command(short_help="Results as files of other programs.")(export.export)

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ctreg_cli.cli import model_refine
+
 if TYPE_CHECKING:
     from ctreg_cli.design.prediction import DesignOptions
 
-app = typer.Typer(no_args_is_help=True, help="List, show and check frames (rod models).", rich_markup_mode=None)
+app = typer.Typer(no_args_is_help=True, help="List, show, check and refine frames (rod models).", rich_markup_mode=None)
 
 Frame = Annotated[
     str,
@@ -114,6 +116,9 @@ def schema(output: SchemaFile = "-") -> None:
         typer.echo(text)
     else:
         write_text(output, text + "\n")
+
+
+app.command("refine")(model_refine.refine)
 
 
 def _options(noise: float, mm_per_px: float, max_tilt: float) -> DesignOptions:

@@ -84,7 +84,9 @@ class Adjustment:
         return float(np.sqrt((self.residual_px[self.matched] ** 2).mean()))
 
 
-def adjust(model: RodModel, T_patient_model: FloatArray, scan: ScanSpots, *, free_scales: bool = False) -> Adjustment:
+def adjust(
+    model: RodModel, T_patient_model: FloatArray, scan: ScanSpots, *, free_scales: bool = False, reject: bool = True
+) -> Adjustment:
     """Minimise χ² over poses, rods and, if asked, a factor on each scale; spots that fit nowhere are left out.
 
     Args:
@@ -92,11 +94,14 @@ def adjust(model: RodModel, T_patient_model: FloatArray, scan: ScanSpots, *, fre
         T_patient_model: (g, 4, 4) starting poses.
         scan: the labelled spots.
         free_scales: also estimate the scales.
+        reject: leave out spots that fit nowhere.
     """
     problem = everything = _Problem(model, scan, free_scales)
     state = problem.start(T_patient_model)
     for _ in range(_ROUNDS):
         state = problem.minimise(state)
+        if not reject:
+            break
         keep = scan.observations.matched & ~_outliers(everything, state)
         if (keep == problem.scan.observations.matched).all():
             break
