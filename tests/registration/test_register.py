@@ -132,11 +132,15 @@ def test_a_symmetric_frame_is_ambiguous_until_its_mount_is_obeyed(name: str) -> 
         free = register(Spots.from_points(uv, 0.05), model, scale=scale, options=RegistrationOptions(use_mount=False))
         assert free.status == "ambiguous", (name, free.reason)
         assert len(free.candidates) >= 2
-        turn = poses.rotation_angle(free.candidates[0].T_slice_model[:3, :3] @ free.candidates[1].T_slice_model[:3, :3].T)
+        turn = poses.rotation_angle(
+            free.candidates[0].T_slice_model[:3, :3] @ free.candidates[1].T_slice_model[:3, :3].T
+        )
         assert turn > np.radians(60)
         settled = register(Spots.from_points(uv, 0.05), model, scale=scale)
         assert settled.status == "ok", (name, settled.reason)
-        error = twist_error(settled.candidates[0].T_slice_model[:3, :3], settled.candidates[0].T_slice_model[:3, 3], R, t)
+        error = twist_error(
+            settled.candidates[0].T_slice_model[:3, :3], settled.candidates[0].T_slice_model[:3, 3], R, t
+        )
         assert np.linalg.norm(error[3:]) < np.radians(3)
 
 
