@@ -18,6 +18,8 @@ SUFFIXES = (".yaml", ".yml")
 STANDARD_OUTPUT = "-"
 #: decimals of a refined coordinate: a tenth of a micrometre
 DECIMALS = 4
+#: of the closing table, also where standard error is no terminal
+TABLE_WIDTH = 110
 
 Tolerance = Annotated[
     float | None,
@@ -126,8 +128,8 @@ def _description(frame: RodModel, refinement: RodRefinement) -> str:
     poses = "one pose" if refinement.one_pose else "a pose each"
     before, after = refinement.rms_before_px, refinement.rms_after_px
     return (
-        f"{frame.name} (sha256 {frame.sha256[:12]}), its rods where {refinement.n_slices} slices with {poses} show them: "
-        f"{refinement.n_spots} spots, residual {before:.3f} px before, {after:.3f} px after. "
+        f"{frame.name} (sha256 {frame.sha256[:12]}), its rods where {refinement.n_slices} slices with {poses} show "
+        f"them: {refinement.n_spots} spots, residual {before:.3f} px before, {after:.3f} px after. "
         "Tolerances are what remains unsure of each rod."
     )
 
@@ -169,14 +171,14 @@ def _tell(talk: Talk, frame: RodModel, refinement: RodRefinement, n_slices: int)
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table("rod", "slices", box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for heading in ("shift at start mm", "sd", "shift at end mm", "sd", "tolerance mm"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for heading in ("rod", "slices", "shift at start mm", "sd", "shift at end mm", "sd", "tolerance mm"):
+        table.add_column(heading, justify="left" if heading == "rod" else "right", no_wrap=True)
     for i, rod in enumerate(refinement.model.rods):
         cells = [text for end in (0, 1) for text in _shift(refinement, i, end)]
         left = f"{frame.rods[i].tolerance_mm:g} → {rod.tolerance_mm:.2g}"
         table.add_row(rod.id, str(refinement.n_seen[i]), *cells, left if refinement.determined[i] else f"{left} unsure")
-    talk.console.print(table)
+    talk.console.print(table, width=TABLE_WIDTH)
     largest = float(norm(refinement.shift_mm, axis=-1).max())
     rows = [
         ("slices", f"{refinement.n_slices} of {n_slices} used, {refinement.n_spots} spots"),

@@ -2,8 +2,9 @@
 
 A frame's ``tolerance`` τ is a lasting error of each rod: it does not average out over slices. So the rods' true
 lines are unknowns too, two shifts across at either end of a rod. Their prior: the rod is off as a whole by τ, and
-tilted by as much at its ends, which makes the shifts of the two ends independent with sd √2 τ. What the slices do
-not say of a rod the prior decides, and the covariance of the pose holds what remains open of both.
+tilted by as much at its ends, which makes the shifts of the two ends independent with sd √2 τ. (A tenth of τ is left
+for a bow, as noise of every spot.) What the slices do not say of a rod the prior decides, and the covariance of the
+pose holds what remains open of both.
 
 The normal equations are an arrow: a 6 × 6 block a pose, and the columns all poses share, eliminated by the Schur
 complement as in :func:`~ctreg_cli.registration.refine.refine_scales`. A twist here is in *patient* axes:
@@ -30,6 +31,8 @@ from ctreg_cli.rods import RodModel
 _OUTLIER2 = 20.0
 #: median of χ² with two degrees of freedom: what the middle spot's Mahalanobis² is when the covariances are true
 _MEDIAN_CHI2_2 = 2 * math.log(2)
+#: a rod that may lie off by its tolerance is not straight either: so much of it is left as noise of every spot
+BOW_SHARE = 0.1
 _ROUNDS = 6
 _ITERATIONS = 60
 _STEP_TOLERANCE = 1e-9
@@ -125,7 +128,8 @@ class _Problem:
     def __init__(self, model: RodModel, scan: ScanSpots, free_scales: bool) -> None:
         self.model = model
         self.scan = scan
-        self.rigid = replace(model, rods=tuple(replace(rod, tolerance_mm=0.0) for rod in model.rods))
+        rods = tuple(replace(rod, tolerance_mm=BOW_SHARE * rod.tolerance_mm) for rod in model.rods)
+        self.written = replace(model, rods=rods)
         self.frames = across(model.directions)
         self.loose = np.nonzero(model.tolerances > 0)[0]
         self.n_scales = 2 if free_scales else 0
@@ -161,9 +165,9 @@ class _Problem:
         o = self.scan.observations
         rods = tuple(
             replace(rod, start=rod.start + d[0], end=rod.end + d[1])
-            for rod, d in zip(self.rigid.rods, self.shift_mm(state), strict=True)
+            for rod, d in zip(self.written.rods, self.shift_mm(state), strict=True)
         )
-        model = replace(self.rigid, rods=rods)
+        model = replace(self.written, rods=rods)
         scale = o.mm_per_px * np.exp(state.log_scale)
         T = poses.inverse(self.scan.T_patient_slice) @ state.T[self.scan.pose_index]
         lin = linearise(model, T, replace(o, mm_per_px=scale))

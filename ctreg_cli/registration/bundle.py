@@ -1,14 +1,15 @@
 """The rods' true lines, from a scan of many slices: real frames are not their drawings (method §7).
 
 Each rod has four unknowns, its two shifts across at either end, with the frame's ``tolerance`` as prior
-(:mod:`~ctreg_cli.registration.adjustment`). Slices whose places are known from DICOM share one pose; without places each
-has a pose of its own. Slices cannot see all rods moved together, for that is a pose: the mean rigid motion of the rods is
-zero (in the prior's weights), and the standard deviations are those of what is left. So a refined frame keeps its own
-coordinates as the mean of its rods, and targets written in them stay put to within the tolerance over √n.
+(:mod:`~ctreg_cli.registration.adjustment`). Slices whose places are known from DICOM share one pose; without places
+each has a pose of its own. Slices cannot see all rods moved together, for that is a pose: the mean rigid motion of the
+rods is zero (in the prior's weights), and the standard deviations are those of what is left. So a refined frame keeps
+its own coordinates as the mean of its rods, and targets written in them stay put to within the tolerance over √n.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +19,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray, frozen
 from ctreg_cli.errors import InputError, MissingScaleError, SingularGeometryError
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.spot_slice import SpotSlice
-from ctreg_cli.registration.adjustment import Adjustment, ScanSpots, adjust
+from ctreg_cli.registration.adjustment import BOW_SHARE, Adjustment, ScanSpots, adjust
 from ctreg_cli.registration.joint import register_joint, scan_spots, spot_of_rod
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import across
@@ -30,15 +31,13 @@ from ctreg_cli.scale import Scale
 MOST_REMAINING = 0.5
 #: least share of the rods that must be known so
 LEAST_DETERMINED = 0.7
-#: a tolerance is never claimed smaller than this share of the prior one: rods bend, and glue creeps
-_LEAST_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RodRefinement:
     """A frame with its rods where a scan found them, and how far and how sure."""
 
-    #: the frame, each rod's tolerance what is left of its uncertainty
+    #: the frame, each rod's tolerance what is left of its uncertainty, and a bow
     model: RodModel
     #: (n, 2, 3) shift of each rod's start and end, model frame, mm
     shift_mm: FloatArray
@@ -160,7 +159,7 @@ def _refinement(model: RodModel, scan: ScanSpots, found: Adjustment, *, free_sca
             rod,
             start=frozen(rod.start + d[0], (3,)),
             end=frozen(rod.end + d[1], (3,)),
-            tolerance_mm=float(min(max(left, _LEAST_TOLERANCE * rod.tolerance_mm), rod.tolerance_mm)),
+            tolerance_mm=min(math.hypot(left, BOW_SHARE * rod.tolerance_mm), rod.tolerance_mm),
         )
         for rod, d, left in zip(model.rods, shift, remaining, strict=True)
     )
@@ -211,6 +210,6 @@ def _check_determined(model: RodModel, scan: ScanSpots, determined: BoolArray, r
         f"{rod.id} ({left:.2g} mm)" for rod, left, ok in zip(model.rods, remaining, determined, strict=True) if not ok
     ]
     raise SingularGeometryError(
-        f"{n_slices} usable slices tell little more of the rods than the tolerance of {model.tolerances.max():g} mm does; "
+        f"{n_slices} usable slices tell little more of the rods than their tolerance ({model.tolerances.max():g} mm); "
         f"still unsure: {', '.join(unknown)}; more slices are needed, spread over the height of the frame"
     )
