@@ -91,8 +91,10 @@ def run_poses(
     more = [ExportSink(output, header, one_slice=len(source) == 1, tell=talk.warn) for output in exports]
     encoding = results_encoding(header, with_uids=arguments.with_uids)
     sinks = open_sinks(outputs, encoding, sys.stdout) if outputs else Sinks[FrameResult]([])
-    for sink in (*session.sinks, *more):
+    for sink in more:
         sinks.add(sink)
+    for live in session.sinks:
+        sinks.add(live, first=True)
     kept: list[FrameResult] = []
     watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
 

@@ -121,7 +121,9 @@ def listening(options: ListenOptions, *, igtl: str | None, quiet: bool) -> Itera
         InputError: what is asked for cannot be had.
     """
     from ctreg_cli.interop.dicom_listener import DicomListener
+    from ctreg_cli.interop.live import warm_up
 
+    warm_up()
     talk = Talk(quiet=quiet)
     sinks, remarks = [], []
     if igtl is not None:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from importlib import import_module
+
+import numpy as np
 
 from ctreg_cli.errors import MissingScaleError
-from ctreg_cli.imaging.segmentation import SegmentationOptions
-from ctreg_cli.imaging.slice import UnreadableSlice
+from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
+from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.pipeline import FrameResult, SliceLike, failure, no_spots, track_slice
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.tracker import Tracker
+
+#: of the slice that is only looked at to load what looking needs, px
+_BLANK_SIDE = 64
 
 
 def track_live(
@@ -51,6 +57,14 @@ def track_live(
             tracker = Tracker(model, options)
             result = failure(place, _without_spots(slice_), "internal_error")
         yield result
+
+
+def warm_up() -> None:
+    """Load what the first slice would otherwise wait for: the readers, and the libraries behind the segmentation."""
+    import_module("ctreg_cli.io.dicom")
+    blank = np.zeros((_BLANK_SIDE, _BLANK_SIDE), dtype=np.int16)
+    blank[_BLANK_SIDE // 2, _BLANK_SIDE // 2] = np.iinfo(np.int16).max
+    find_spots(Slice(info=SliceInfo(source=""), stored=blank), SegmentationOptions())
 
 
 def _without_spots(slice_: SliceLike) -> SpotSlice:

@@ -50,6 +50,8 @@ class TargetRecord:
     position_slice: FloatArray
     position_patient: FloatArray | None
     tre_mm: float
+    #: protection level, mm; None where it is not known, or nothing bounds the error
+    pl_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -145,6 +147,7 @@ class _Target(_Loose):
     position_slice: Vector
     position_patient: Vector | None = None
     tre_mm: Finite
+    pl_mm: Finite | None = None
 
 
 class _Warning(_Loose):
@@ -326,6 +329,7 @@ def _record(entry: _Result, raw: Mapping[str, object]) -> SliceRecord:
                 position_slice=frozen(target.position_slice, (3,)),
                 position_patient=None if target.position_patient is None else frozen(target.position_patient, (3,)),
                 tre_mm=target.tre_mm,
+                pl_mm=target.pl_mm,
             )
             for target in entry.targets
         ),

@@ -266,9 +266,9 @@ class Sinks(Generic[Item]):
     def alive(self) -> bool:
         return bool(self._sinks)
 
-    def add(self, sink: Sink[Item]) -> None:
-        """One more output."""
-        self._sinks.append(sink)
+    def add(self, sink: Sink[Item], *, first: bool = False) -> None:
+        """One more output, written before all others where it cannot wait."""
+        self._sinks.insert(0 if first else len(self._sinks), sink)
 
     def write(self, item: Item) -> None:
         with _uninterrupted():

@@ -15,7 +15,7 @@ from importlib.resources import files
 import numpy as np
 
 from ctreg_cli._version import __version__
-from ctreg_cli.io.results_document import ResultsDocument, SliceRecord
+from ctreg_cli.io.results_document import ResultsDocument, SliceRecord, TargetRecord
 from ctreg_cli.report import svg
 from ctreg_cli.report.pictures import View, common_view
 from ctreg_cli.report.series import COMPONENTS, pose_series, residuals
@@ -201,18 +201,25 @@ def _residuals(records: Sequence[SliceRecord]) -> str:
 
 
 def _targets(usable: Iterable[SliceRecord]) -> str:
-    errors: dict[str, list[float]] = {}
+    found: dict[str, list[TargetRecord]] = {}
     for record in usable:
         for target in record.targets:
-            errors.setdefault(target.id, []).append(target.tre_mm)
-    if not errors:
+            found.setdefault(target.id, []).append(target)
+    if not found:
         return "<p>The frame file names no targets.</p>"
-    rows = [
-        f'<tr><th scope="row">{escape(name)}</th><td>{len(values)}</td><td>{np.median(values):.3g}</td>'
-        f"<td>{max(values):.3g}</td></tr>"
-        for name, values in errors.items()
-    ]
-    head = "<tr><th>target</th><th>ok slices</th><th>median (mm)</th><th>greatest (mm)</th></tr>"
+    rows = []
+    for name, targets in found.items():
+        errors = [target.tre_mm for target in targets]
+        levels = [target.pl_mm for target in targets if target.pl_mm is not None]
+        level = f"{max(levels):.3g}" if len(levels) == len(targets) else "none stated"
+        rows.append(
+            f'<tr><th scope="row">{escape(name)}</th><td>{len(targets)}</td><td>{np.median(errors):.3g}</td>'
+            f"<td>{max(errors):.3g}</td><td>{level}</td></tr>"
+        )
+    head = (
+        "<tr><th>target</th><th>ok slices</th><th>median TRE (mm)</th><th>greatest TRE (mm)</th>"
+        "<th>greatest protection level (mm)</th></tr>"
+    )
     return f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -154,9 +155,9 @@ def test_tum_and_kitti_are_metres(content: Content, tmp_path: Path) -> None:
 
 
 def test_evo_takes_the_trajectory(content: Content, tmp_path: Path) -> None:
-    evo = shutil.which("evo_traj") or shutil.which("evo_traj", path=str(Path(shutil.which("python") or "").parent))
+    evo = shutil.which("evo_traj") or shutil.which("evo_traj", path=str(Path(sys.executable).parent))
     if evo is None:
-        pytest.skip("evo is not installed")
+        pytest.skip("the program evo_traj is not installed")
     write_export(str(tmp_path / "t.tum"), content)
     home = {"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
     done = subprocess.run(  # a program of its own, for its licence
