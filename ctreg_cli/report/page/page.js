@@ -6,6 +6,7 @@
   const slider = byId("slider"), view = byId("view"), canvas = byId("scene");
   const SVG = "http://www.w3.org/2000/svg";
   const RESIDUAL_ZOOM = 50;
+  const LABEL_AT = 0.85;
   let at = 0;
 
   // ---- one slice -------------------------------------------------------------------------------------------------
@@ -135,7 +136,11 @@
     halves.filter((half) => half.side * facing < 0).forEach(drawHalf);
     drawPlane();
     halves.filter((half) => half.side * facing >= 0).forEach(drawHalf);
-    for (const rod of scene.rods) { const a = project(rod.ends[1]); g.fillStyle = soft; g.fillText(rod.id, a.x + 5, a.y - 3); }
+    for (const { id, ends: [p, q] } of scene.rods) {
+      const a = project(p.map((value, k) => value + LABEL_AT * (q[k] - value)));  // ends of rods often meet, these do not
+      g.fillStyle = soft;
+      g.fillText(id, a.x + 6, a.y + 4);
+    }
     for (const spot of scene.spots) dot(spot.place, 4.5, mark);
     for (const target of scene.targets) {
       const a = project(target.place);
