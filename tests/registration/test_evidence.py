@@ -80,7 +80,7 @@ def test_chance_matches_obey_markovs_inequality() -> None:
     """Of scenes of pure clutter at most a share e^-x reaches ln odds x."""
     rng = np.random.default_rng(904)
     best = []
-    for _ in range(60):
+    for _ in range(30):
         model = model_of(random_frame(rng, 6))
         xy = 100 + rng.uniform(-15, 15, (int(rng.integers(6, 14)), 2))
         scene = Scene(

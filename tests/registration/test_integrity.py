@@ -21,7 +21,7 @@ def with_target(model: RodModel) -> RodModel:
 def test_no_error_exceeds_its_level_though_one_spot_is_off() -> None:
     rng = np.random.default_rng(931)
     checked, levels = 0, []
-    for _ in range(60):
+    for _ in range(20):
         frame = random_frame(rng, int(rng.integers(6, 10)))
         world = some_scene(rng, frame, sd_px=0.1, least=6)
         uv, angle = np.array(world.uv_px), rng.uniform(0, 2 * np.pi)
@@ -34,7 +34,7 @@ def test_no_error_exceeds_its_level_though_one_spot_is_off() -> None:
             assert error < best.protection_mm[0]
             levels.append(best.protection_mm[0])
             checked += 1
-    assert checked > 40
+    assert checked > 12
     assert np.median(levels) < 40  # a level that says nothing would hold too
 
 

@@ -86,7 +86,7 @@ def test_sd_of_the_scales_is_true() -> None:
     rng = np.random.default_rng(913)
     frame = random_frame(rng, 9, 60, 80)
     squares = []
-    for _ in range(60):
+    for _ in range(40):
         worlds = [some_scene(rng, frame, sd_px=0.2, mm_per_px=(0.5, 0.55), least=8) for _ in range(2)]
         found = refine_scales(model_of(frame), np.stack([w.T for w in worlds]), observed(frame, worlds))
         error = found.mm_per_px - [0.5, 0.55]

@@ -76,7 +76,7 @@ def test_a_shifted_image_shifts_the_pose_and_nothing_else() -> None:
 def test_errors_are_as_large_as_the_covariance_says_and_as_the_bound_allows() -> None:
     rng = np.random.default_rng(805)
     own, ideal = [], []
-    for _ in range(150):
+    for _ in range(50):
         world = some_scene(rng, frame_of(CUBE), sd_px=0.1, least=8)
         result = registered(world, CUBE)
         assert result.status == "ok"
@@ -84,12 +84,12 @@ def test_errors_are_as_large_as_the_covariance_says_and_as_the_bound_allows() ->
         error = error_of(best.T_slice_model, world)
         own.append(error @ np.linalg.inv(best.covariance) @ error)
         ideal.append(error @ np.linalg.inv(world.bound) @ error)
-    # χ² of 6 degrees: mean 6, sd of the mean √12/√150 = 0.28; three of them
-    assert abs(np.mean(own) - 6) < 0.85, np.mean(own)
-    assert abs(np.mean(ideal) - 6) < 0.85, np.mean(ideal)
+    # χ² of 6 degrees: mean 6, sd of the mean √12/√50 = 0.49; three of them
+    assert abs(np.mean(own) - 6) < 1.5, np.mean(own)
+    assert abs(np.mean(ideal) - 6) < 1.5, np.mean(ideal)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(12))
 def test_pure_clutter_is_never_a_pose(seed: int) -> None:
     rng = np.random.default_rng([806, seed])
     uv = 250 + rng.uniform(-45, 45, (int(rng.integers(3, 25)), 2))
@@ -189,7 +189,7 @@ def test_a_frame_off_its_drawing_is_known_by_its_tolerance() -> None:
     drawn = random_frame(rng, 9, size=150, height=120)
     model = model_of(drawn, tolerance_mm=0.4)
     squares = []
-    for _ in range(40):
+    for _ in range(20):
         offset = rng.normal(size=drawn.starts.shape) * 0.4
         built = OracleFrame(drawn.starts + offset, drawn.ends + offset)
         world = some_scene(rng, built, sd_px=0.05, least=8, tilt_rad=0.1)
@@ -198,8 +198,8 @@ def test_a_frame_off_its_drawing_is_known_by_its_tolerance() -> None:
         if result.status == "ok":
             error = error_of(result.candidates[0].T_slice_model, world)
             squares.append(error @ np.linalg.inv(result.candidates[0].covariance) @ error)
-    assert len(squares) > 30
-    assert np.mean(squares) < 6 * 1.35, np.mean(squares)  # 3 sd of a mean of forty
+    assert len(squares) > 15
+    assert np.mean(squares) < 6 * 1.4, np.mean(squares)  # 3 sd of a mean of twenty
     assert np.max(squares) < 40
 
 
