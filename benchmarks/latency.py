@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import socket
 import statistics
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +31,7 @@ FRAME = "rod-cube-30x30x40"
 SERIES = 60
 MEDIAN_LIMIT_MS, P99_LIMIT_MS = 15.0, 40.0
 UID_DIGITS = 20
+INTERVAL_S = 1 / 12
 
 
 class Client:
@@ -77,23 +80,35 @@ def free_port() -> int:
 
 
 def templates(folder: Path) -> list[bytes]:
-    """Slices of a breathing frame; each holds its own SOP Instance UID, made to a known length."""
+    """Slices of a frame that breathes, the last followed by the first; UIDs and times have places of known length."""
     import pydicom
 
-    command = ["simulate", "-m", FRAME, "--frames", str(SERIES), "--interval-s", "0.0833", "-o", str(folder / "series")]
+    motion = ["--interval-s", str(INTERVAL_S), "--period-s", str(SERIES * INTERVAL_S)]
+    command = ["simulate", "-m", FRAME, "--frames", str(SERIES), *motion, "-o", str(folder / "series")]
     subprocess.run([sys.executable, "-m", "ctreg_cli", *command, "-q"], check=True)
     found = []
     for path in sorted((folder / "series").glob("*.dcm")):
         ds = pydicom.dcmread(path)
-        ds.SOPInstanceUID = ds.file_meta.MediaStorageSOPInstanceUID = f"2.25.1{0:0{UID_DIGITS}d}"
+        ds.SOPInstanceUID = ds.file_meta.MediaStorageSOPInstanceUID = _uid(0)
+        for keyword in ("AcquisitionTime", "ContentTime"):
+            setattr(ds, keyword, _time(0))
         ds.save_as(path)
         found.append(path.read_bytes())
     return found
 
 
+def _uid(number: int) -> str:
+    return f"2.25.1{number:0{UID_DIGITS}d}"
+
+
+def _time(number: int) -> str:
+    seconds = 8 * 3600 + number * INTERVAL_S
+    return f"{int(seconds // 3600):02d}{int(seconds // 60 % 60):02d}{seconds % 60:09.6f}"
+
+
 def renamed(data: bytes, number: int) -> bytes:
-    """The same slice as an instance of its own."""
-    return data.replace(f"2.25.1{0:0{UID_DIGITS}d}".encode(), f"2.25.1{number + 1:0{UID_DIGITS}d}".encode())
+    """The same slice as an instance and at a time of its own."""
+    return data.replace(_uid(0).encode(), _uid(number + 1).encode()).replace(_time(0).encode(), _time(number).encode())
 
 
 @contextlib.contextmanager
@@ -136,12 +151,14 @@ def latency(n: int, rate_hz: float) -> bool:
             if not client.wait(n, 10):
                 print(f"lost: {n - len(client.slices)} of {n} slices")
                 return False
+        methods = Counter(json.loads(line)["method"] for line in (folder / "poses.jsonl").open() if '"method"' in line)
     ms = sorted(1000 * (came - sent) for sent, (_, came) in zip(done, client.slices, strict=True) if came is not None)
     n_lost = n - len(ms)
     p99 = ms[min(len(ms) - 1, round(0.99 * len(ms)))]
     median = statistics.median(ms)
     print(f"{n} slices of 512 × 512 at {achieved:.1f}/s, {n_lost} without a pose, {os.cpu_count()} cores")
     print(f"C-STORE answered → TRANSFORM received: median {median:.1f} ms, 99 % {p99:.1f} ms, greatest {ms[-1]:.1f} ms")
+    print("poses by method:", ", ".join(f"{count} {method or 'none'}" for method, count in methods.most_common()))
     print("(negative: the pose was there before storescu had read its answer)")
     good = median <= MEDIAN_LIMIT_MS and p99 <= P99_LIMIT_MS
     print("within" if good else "NOT within", f"median {MEDIAN_LIMIT_MS:g} ms, 99 % {P99_LIMIT_MS:g} ms")
@@ -185,7 +202,8 @@ def soak(n: int) -> bool:
             start = time.perf_counter()
             for number in range(n):
                 dataset = datasets[number % len(datasets)]
-                dataset.SOPInstanceUID = f"2.25.1{number + 1:0{UID_DIGITS}d}"
+                dataset.SOPInstanceUID = _uid(number + 1)
+                dataset.AcquisitionTime = dataset.ContentTime = _time(number)
                 if association.send_c_store(dataset).Status != 0:
                     print(f"slice {number} was refused")
                     return False

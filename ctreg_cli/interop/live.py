@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 
@@ -19,6 +21,8 @@ from ctreg_cli.tracking.tracker import Tracker
 
 #: of the slice that is only looked at to load what looking needs, px
 _BLANK_SIDE = 64
+#: Python's own is 5 ms, a third of what a slice may take
+_SWITCH_S = 0.001
 
 
 def track_live(
@@ -60,11 +64,19 @@ def track_live(
 
 
 def warm_up() -> None:
-    """Load what the first slice would otherwise wait for: the readers, and the libraries behind the segmentation."""
+    """Ready this process for slices in real time.
+
+    Loaded is what the first slice would otherwise wait for: the readers, and the libraries behind the segmentation.
+    """
     import_module("ctreg_cli.io.dicom")
     blank = np.zeros((_BLANK_SIDE, _BLANK_SIDE), dtype=np.int16)
     blank[_BLANK_SIDE // 2, _BLANK_SIDE // 2] = np.iinfo(np.int16).max
     find_spots(Slice(info=SliceInfo(source=""), stored=blank), SegmentationOptions())
+    # a full garbage collection over everything loaded takes longer than a slice may: leave that out of every later one
+    gc.collect()
+    gc.freeze()
+    # threads that talk to peers hand over to the tracker sooner
+    sys.setswitchinterval(_SWITCH_S)
 
 
 def _without_spots(slice_: SliceLike) -> SpotSlice:
