@@ -3,8 +3,8 @@
     python benchmarks/minimal.py [--trials 10000] [--seed 1]
 
 Half of the triples are random, half come from a cube with four parallel rods and slanted ones on its faces, so that
-parallel pairs and rods that meet at a corner are common. Spots come from the tests' oracle, which shares no code with the
-package. (The matcher's ``scan_three`` trades such corners for speed; it is meant for frames as they are built.)
+parallel pairs and rods that meet at a corner are common. Spots come from the tests' oracle, which shares no code with
+the package. (The matcher's ``scan_three`` trades such corners for speed; it is meant for frames as they are built.)
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ SUFFIXES = (".yaml", ".yml")
 STANDARD_OUTPUT = "-"
 #: decimals of a refined coordinate: a tenth of a micrometre
 DECIMALS = 4
-#: of the closing table, also where standard error is no terminal
+#: of the closing table where standard error is no terminal
 TABLE_WIDTH = 110
 
 Tolerance = Annotated[
@@ -178,7 +178,9 @@ def _tell(talk: Talk, frame: RodModel, refinement: RodRefinement, n_slices: int)
         cells = [text for end in (0, 1) for text in _shift(refinement, i, end)]
         left = f"{frame.rods[i].tolerance_mm:g} → {rod.tolerance_mm:.2g}"
         table.add_row(rod.id, str(refinement.n_seen[i]), *cells, left if refinement.determined[i] else f"{left} unsure")
-    talk.console.print(table, width=TABLE_WIDTH)
+    if not talk.console.is_terminal:
+        talk.console.width = TABLE_WIDTH
+    talk.console.print(table)
     largest = float(norm(refinement.shift_mm, axis=-1).max())
     rows = [
         ("slices", f"{refinement.n_slices} of {n_slices} used, {refinement.n_spots} spots"),
