@@ -18,7 +18,7 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import project, within_bounds
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from ctreg_cli.tracking.servo import Desired, ServoOptions, pseudoinverse, servo, stability_margin, view
+from ctreg_cli.tracking.servo import Desired, ServoOptions, servo, view
 
 Strategy = Literal["updated", "constant"]
 #: three pairs of rod and spot determine the twist
@@ -116,15 +116,6 @@ def run_servo(
             jacobian=at_desired.jacobian if strategy == "constant" else None,
             keep_path=True,
         )
-        J_constant = pseudoinverse(at_desired.jacobian, at_desired)
-        margins = [
-            stability_margin(
-                J_constant if strategy == "constant" else pseudoinverse(here.jacobian, here),
-                here.jacobian,
-                model.size_mm,
-            )
-            for here in (view(desired, T) for T in _path(moved.path_T))
-        ]
     except np.linalg.LinAlgError as error:
         raise SingularGeometryError(f"{model.name}: the rods seen at both poses do not determine the pose") from error
     path = _path(moved.path_T)
@@ -136,7 +127,7 @@ def run_servo(
         spots_px=_path(moved.path_px),
         T=path,
         error=_errors(path, T_desired),
-        margin=np.array(margins),
+        margin=_path(moved.path_margin),
         bound=np.asarray(settings.noise_px**2 * np.linalg.inv(J.T @ J)),
     )
 

@@ -136,9 +136,10 @@ class ServoResult:
     converged: bool
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J at the end
     margin: float
-    #: (i + 1, 4, 4) poses from start to end, and (i + 1, k, 2) their spots, px; only when asked for
+    #: only when asked for: (i + 1, 4, 4) poses from start to end, (i + 1, k, 2) their spots, px, and (i + 1,) margins
     path_T: FloatArray | None = None
     path_px: FloatArray | None = None
+    path_margin: FloatArray | None = None
 
 
 def pseudoinverse(jacobian: FloatArray, here: View) -> FloatArray:
@@ -190,7 +191,7 @@ def servo(
     unit = _unit(model.size_mm)
     here = view(desired, T)
     J_plus = pseudoinverse(here.jacobian if jacobian is None else jacobian, here)
-    path = [(T, here.spots_px)]
+    path = [(T, here.spots_px, stability_margin(J_plus, here.jacobian, model.size_mm))] if keep_path else []
     converged, iterations = False, 0
     while not converged and iterations < options.max_iterations:
         step = options.gain * (J_plus @ here.residual_px.reshape(-1))  # the residual is s* − s
@@ -198,12 +199,12 @@ def servo(
         iterations += 1
         T = poses.update(T, step)
         last, here = here, view(desired, T)
-        if keep_path:
-            path.append((T, here.spots_px))
         if not np.isfinite(here.residual_px).all():
             raise np.linalg.LinAlgError("a rod came to lie in the slice")
         if jacobian is None:
             J_plus = pseudoinverse(here.jacobian, here)
+        if keep_path:
+            path.append((T, here.spots_px, stability_margin(J_plus, here.jacobian, model.size_mm)))
         moved = float(np.abs(step * unit).max()) / model.size_mm
         d = here.spots_px - last.spots_px
         moved_sd2 = float((d[:, None] @ here.weight @ d[:, :, None]).sum())
@@ -223,8 +224,9 @@ def servo(
         iterations=iterations,
         converged=converged,
         margin=stability_margin(J_plus, here.jacobian, model.size_mm) if converged else -np.inf,
-        path_T=np.stack([p for p, _ in path]) if keep_path else None,
-        path_px=np.stack([s for _, s in path]) if keep_path else None,
+        path_T=np.stack([p for p, _, _ in path]) if keep_path else None,
+        path_px=np.stack([s for _, s, _ in path]) if keep_path else None,
+        path_margin=np.array([m for _, _, m in path]) if keep_path else None,
     )
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.design.symmetry import symmetries
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field
 from ctreg_cli.geometry.projection import project
@@ -33,7 +34,7 @@ from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.prior import PastPrior
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
-from ctreg_cli.tracking.variants import covering, with_other_rods
+from ctreg_cli.tracking.variants import covering, with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -46,6 +47,8 @@ LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 _ASSIGNMENTS = 3
 #: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
+#: motions that take the rods onto each other as nearly as this (in frame sizes) make a twin worth looking at
+_SYMMETRIC_WITHIN = 0.05
 #: spots or rods up to which a match of four is looked for
 _FEW = 6
 #: so many spots where the past expects them speak for it even when they do not make a pose
@@ -122,6 +125,7 @@ class Tracker:
         #: (n, 2, 6) Ĵ of the constant strategy, mm per mm and rad
         self._kept_jacobian: FloatArray | None = None
         self._is_lost = False
+        self._symmetries = symmetries(model, within_mm=_SYMMETRIC_WITHIN * model.size_mm)
         gain = self.options.gain
         self._servo_options = ServoOptions(
             gain=gain, spot_tolerance_sd=_DONE_SD, max_iterations=math.ceil(_MAX_FULL_STEPS / gain)
@@ -256,6 +260,8 @@ class Tracker:
         model, constant = self.model, self.options.jacobian == "constant"
         if constant and self._kept_jacobian is None:
             return None, "no Jacobian has been kept yet"
+        if len(scene.xy_mm) < CHECKABLE_MATCHES:
+            return None, ""
         spot_of_rod = nearest_assignment(model, scene, prediction.T[None], prediction.covariance)[0]
         T = prediction.T
         for _ in range(_ASSIGNMENTS):
@@ -317,6 +323,7 @@ class Tracker:
 
     def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
         """Matches and all that could be said instead of the best of them."""
+        matches = with_twins(self.model, scene, matches, self._symmetries, least_matches)
         matches = with_other_rods(self.model, scene, matches, least_matches)
         return doubt(self.model, scene, matches, least_matches=least_matches)
 

@@ -1,4 +1,4 @@
-"""What else a followed match could be: another rod at a spot, or a spot that is no rod's.
+"""What else a match could be: a twin, another rod at a spot, or a spot that is no rod's.
 
 Registration looks for both over the whole slice; here they are looked for about one match, so that a tracked slice is
 doubted at little cost and no rival is overlooked that lies close by.
@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ctreg_cli.arrays import IntArray, frozen
+from ctreg_cli.design.symmetry import Symmetry
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.registration.matching import Matches, Scene, join, weigh
@@ -40,6 +41,22 @@ def with_other_rods(model: RodModel, scene: Scene, matches: Matches, least_match
     if not variants:
         return matches
     found = weigh(model, scene, np.repeat(matches.T[:1], len(variants), axis=0), np.stack(variants), least_matches)
+    return matches if found is None else join([matches, found])
+
+
+def with_twins(
+    model: RodModel, scene: Scene, matches: Matches, symmetric: tuple[Symmetry, ...], least_matches: int
+) -> Matches:
+    """``matches`` and, for the best of them, what each symmetry of the frame makes of it.
+
+    A motion S that takes rod i to rod ``image[i]`` makes of the pose T the pose T S; the spot of ``image[i]`` is then
+    that of i.
+    """
+    if not symmetric:
+        return matches
+    T = matches.T[0] @ np.stack([s.transform for s in symmetric])
+    spot_of_rod = np.stack([matches.spot_of_rod[0][s.image] for s in symmetric])
+    found = weigh(model, scene, T, spot_of_rod, least_matches)
     return matches if found is None else join([matches, found])
 
 
