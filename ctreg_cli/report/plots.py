@@ -23,7 +23,7 @@ _STYLE = {"font.size": 8, "svg.fonttype": "none", "svg.hashsalt": "ctreg", "axes
 _STYLE |= {"axes.spines.right": False}
 
 
-def plots(document: ResultsDocument) -> Iterator[tuple[str, bytes]]:
+def plots(document: ResultsDocument, *, png_dpi: int = PNG_DPI) -> Iterator[tuple[str, bytes]]:
     """File names and contents of all figures: ``pose`` and, where the results hold matches, ``residuals``.
 
     Raises:
@@ -35,10 +35,10 @@ def plots(document: ResultsDocument) -> Iterator[tuple[str, bytes]]:
     if not np.isfinite(series.values).any():
         raise InputError(f"{document.name}: no slice has a pose to plot")
     with matplotlib.rc_context(_STYLE):
-        yield from _rendered("pose", _pose_figure(backend.Figure, document))
+        yield from _rendered("pose", _pose_figure(backend.Figure, document), png_dpi)
         by_rod = residuals(document.records)
         if by_rod:
-            yield from _rendered("residuals", _residual_figure(backend.Figure, document))
+            yield from _rendered("residuals", _residual_figure(backend.Figure, document), png_dpi)
 
 
 def _pose_figure(figure_class: Any, document: ResultsDocument) -> Any:
@@ -75,8 +75,8 @@ def _residual_figure(figure_class: Any, document: ResultsDocument) -> Any:
     return figure
 
 
-def _rendered(name: str, figure: Any) -> Iterator[tuple[str, bytes]]:
-    for suffix, options in (("png", {"dpi": PNG_DPI}), ("svg", {"metadata": {"Date": None}})):
+def _rendered(name: str, figure: Any, png_dpi: int) -> Iterator[tuple[str, bytes]]:
+    for suffix, options in (("png", {"dpi": png_dpi}), ("svg", {"metadata": {"Date": None}})):
         stream = io.BytesIO()
         figure.savefig(stream, format=suffix, **options)
         yield f"{name}.{suffix}", stream.getvalue()

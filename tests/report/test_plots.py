@@ -20,10 +20,10 @@ pytest.importorskip("matplotlib")
 def test_figures_are_png_and_svg(tmp_path: Path) -> None:
     from PIL import Image
 
-    from ctreg_cli.report.plots import PNG_DPI, WIDTH_IN, plots
+    from ctreg_cli.report.plots import WIDTH_IN, plots
 
     document = read_document(written(tmp_path))
-    found = dict(plots(document))
+    found = dict(plots(document, png_dpi=60))
     assert sorted(found) == ["pose.png", "pose.svg", "residuals.png", "residuals.svg"]
     for name, content in found.items():
         if name.endswith(".svg"):
@@ -31,8 +31,8 @@ def test_figures_are_png_and_svg(tmp_path: Path) -> None:
             assert root.tag.endswith("svg")
             assert "px" in "".join(root.itertext()) or "mm" in "".join(root.itertext())  # text stays text
         else:
-            assert Image.open(io.BytesIO(content)).width == round(WIDTH_IN * PNG_DPI)
-    assert dict(islice(plots(document), 2))["pose.svg"] == found["pose.svg"]
+            assert Image.open(io.BytesIO(content)).width == round(WIDTH_IN * 60)
+    assert dict(islice(plots(document, png_dpi=60), 2))["pose.svg"] == found["pose.svg"]
 
 
 def test_no_pose_no_figure(tmp_path: Path) -> None:
