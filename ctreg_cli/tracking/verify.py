@@ -42,6 +42,8 @@ CHANCE_IN_GATE = 0.003
 VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
 #: steps to the pose most probable with the past; how far it may lie from the one without (χ² of six degrees of freedom)
 _MAP_STEPS, _AGREES_D2 = 6, 30.0
+#: nearer than this nothing is seen; farther off, the cost must have risen by this share of what the covariance says
+_NEAR_D2, _LEAST_RISE = 9.0, 0.5
 #: innovations beyond this (χ² of six degrees of freedom: 1 in 30,000) are looked into
 _ODD_INNOVATION2 = 30.0
 #: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
@@ -147,7 +149,12 @@ def agrees_with_past(
         gradient = WJ.T @ here.residual_px.reshape(-1) - information @ poses.difference(T, T_predicted)
         T = poses.update(T, np.asarray(np.linalg.solve(WJ.T @ here.jacobian + information, gradient)))
     apart = poses.difference(T, best.T_slice_model)
-    return bool(apart @ np.linalg.solve(best.covariance, apart) <= _AGREES_D2)
+    distance2 = float(apart @ np.linalg.solve(best.covariance, apart))
+    if distance2 > _AGREES_D2:
+        return False
+    # the cost rises from its lowest point by the squared distance, if the covariance describes it
+    rise = view(desired, T).chi2 - best.chi2
+    return distance2 < _NEAR_D2 or rise > _LEAST_RISE * distance2
 
 
 def _worst_turn(covariance: FloatArray) -> float:
