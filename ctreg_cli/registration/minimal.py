@@ -1,18 +1,18 @@
-"""Three rods, three spots: every real pose (Doignon et al. 2008, §2; the generalised three-point problem with rods as rays).
+"""Three rods, three spots: every real pose (Doignon et al. 2008, §2; the generalised P3P with rods as rays).
 
-Three spots have three known distances, and the pose is known once the points ``P_i = p_i + λ_i y_i`` of the rods that lie
-in the slice are: ``|P_i − P_j| = d_ij``. Given λ₁, both λ₂ and λ₃ follow from quadratics,
+Three spots have three known distances, and the pose is known once the points ``P_i = p_i + λ_i y_i`` of the rods
+that lie in the slice are: ``|P_i − P_j| = d_ij``. Given λ₁, both λ₂ and λ₃ follow from quadratics,
 
     λ_j = q_j ± √D_j,   q_j = −y_j·w_j,   D_j = q_j² − |w_j|² + d_1j²,   w_j = p_j − p_1 − λ₁ y_1,
 
-and what is left, ``F = |P₂ − P₃|² − d₂₃² = A + B σ₂√D₂ + C σ₃√D₃ + E σ₂σ₃√D₂√D₃``, is one equation in λ₁ on the bounded rod.
-The product of F over the four signs is free of roots, a polynomial of degree 8 in λ₁,
+and what is left, ``F = |P₂ − P₃|² − d₂₃² = A + B σ₂√D₂ + C σ₃√D₃ + E σ₂σ₃√D₂√D₃``, is one equation in λ₁ on the
+bounded rod. The product of F over the four signs is free of roots, a polynomial of degree 8 in λ₁,
 
     G = P² − D₂ Q²,   P = A² + B² D₂ − C² D₃ − E² D₂ D₃,   Q = 2 (A B − C E D₃).
 
 Nothing here divides by anything that vanishes for parallel rods: they only lower the degree of D.
-G is *evaluated*, not expanded. Per rod triple only three numbers (the squared distances) change from one spot triple to the
-next, so that one table over λ₁ serves all of them.
+G is *evaluated*, not expanded. Per rod triple only three numbers (the squared distances) change from one spot
+triple to the next, so that one table over λ₁ serves all of them.
 """
 
 from __future__ import annotations
@@ -122,10 +122,12 @@ def solve_three(
         triples: the rods, shared by all spot triples or one row each.
         xy_mm: (h, 3, 2) spots in slice coordinates, mm, in the order of the rods.
         slack_mm: how far beyond a rod's ends a solution may lie.
-        noise_mm: spot noise; a pair of solutions that noise has just made complex is still returned (as one near-solution).
+        noise_mm: spot noise; a pair of solutions that noise has just made complex is still returned (as one
+        near-solution).
 
     Returns:
-        ``T_slice_model`` (r, 4, 4) of all solutions and (r,) the spot triple each belongs to. Three parallel rods give none.
+        ``T_slice_model`` (r, 4, 4) of all solutions and (r,) the spot triple each belongs to. Three parallel rods
+        give none.
     """
     d2 = squared_distances(xy_mm)
     low, high = _reachable(triples, d2, slack_mm, noise_mm)  # (h, 1)
@@ -144,10 +146,11 @@ def solve_three(
 
 
 def _reachable(triples: RodTriples, d2: FloatArray, slack_mm: float, noise_mm: float) -> tuple[FloatArray, FloatArray]:
-    """The part (low, high), each (h, 1), of the first rod from which both other rods are within reach: D₂ ≥ 0 and D₃ ≥ 0.
+    """The part (low, high), each (h, 1), of the first rod with both others within reach: D₂ ≥ 0 and D₃ ≥ 0.
 
-    ``D_j = d_1j² − (distance from P₁ to line j)²`` is concave in λ₁, so that each bounds an interval. Where rods meet at a
-    corner and the triangle is small, that interval is a thousandth of the rod, and only on it do the roots of G stand apart.
+    ``D_j = d_1j² − (distance from P₁ to line j)²`` is concave in λ₁, so that each bounds an interval. Where rods
+    meet at a corner and the triangle is small, that interval is a thousandth of the rod, and only on it do the
+    roots of G stand apart.
     """
     p, y = triples.starts, triples.directions
     gap, cosine = p[:, 1:] - p[:, :1], np.einsum("gjk,gk->gj", y[:, 1:], y[:, 0])
@@ -173,11 +176,11 @@ def _reachable(triples: RodTriples, d2: FloatArray, slack_mm: float, noise_mm: f
 def scan_three(
     triples: RodTriples, xy_mm: FloatArray, *, slack_mm: float, noise_mm: float, samples: int = 16
 ) -> tuple[FloatArray, IntArray]:
-    """Like :func:`solve_three` for tens of thousands of spot triples: sign changes and near misses of F on a grid of λ₁.
+    """Like :func:`solve_three` for tens of thousands of spot triples: sign changes and near misses of F on a grid.
 
-    Each of the four sign choices is scanned by itself, where its roots lie far apart (those of G crowd together for parallel
-    rods at a small tilt). Beyond a fold (D < 0) F goes on with √D = 0, so that a root beside the fold still shows as a sign
-    change, and one that noise has pushed over it as a small value.
+    Each of the four sign choices is scanned by itself, where its roots lie far apart (those of G crowd together
+    for parallel rods at a small tilt). Beyond a fold (D < 0) F goes on with √D = 0, so that a root beside the
+    fold still shows as a sign change, and one that noise has pushed over it as a small value.
     """
     d2 = squared_distances(xy_mm)
     low, high = -slack_mm, triples.lengths[:, :1] + slack_mm
@@ -231,7 +234,7 @@ def _evaluate_G(terms: Quadratics) -> FloatArray:
 
 
 def _chebyshev_roots(coefficients: FloatArray) -> NDArrayComplex:
-    """Eigenvalues (h, 8) of the colleague matrices of Chebyshev series (h, 9); a vanishing lead is nudged, not divided by."""
+    """Eigenvalues (h, 8) of the colleague matrices of Chebyshev series (h, 9); a vanishing lead is nudged."""
     h, n = coefficients.shape[0], DEGREE
     lead = coefficients[:, n]
     tiny = 1e-14
@@ -352,8 +355,8 @@ def _lay_triangles(P: FloatArray, Q: FloatArray) -> tuple[FloatArray, BoolArray]
 def _triangle_basis(P: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Right-handed orthonormal bases (r, 3, 3), columns: along side 1–2, in the plane, normal.
 
-    The in-plane angle is the mean of those of the three corners seen from the centre would be more even under noise; the
-    side is exact for exact triangles, and refinement follows.
+    The mean angle of the three corners seen from the centre would be more even under noise; the side is exact for
+    exact triangles, and refinement follows.
     """
     a, b = P[:, 1] - P[:, 0], P[:, 2] - P[:, 0]
     n = np.cross(a, b)

@@ -48,7 +48,7 @@ def test_shifts_are_found_as_sure_as_is_said() -> None:
     rng = np.random.default_rng(1)
     found_all, ratio = [], []
     for _ in range(3):
-        model, scan = drawn_and_scanned(rng, n_slices=7)
+        model, scan = drawn_and_scanned(rng, n_slices=6)
         found = refine_rods(scan.slices, model)
         assert found.one_pose
         assert found.determined.all()

@@ -42,7 +42,7 @@ def joint_bound(scan: Scan, frame: oracle.OracleFrame, sd_px: float) -> np.ndarr
 def test_exact_rods_give_the_joint_bound() -> None:
     rng = np.random.default_rng(1)
     against_bound, against_own = [], []
-    for _ in range(12):
+    for _ in range(8):
         frame, scan = frame_and_scan(rng, sd_px=0.2, n_slices=3)
         joint = register_joint(scan.slices, model_of(frame))
         assert joint.status == "ok"
@@ -50,7 +50,7 @@ def test_exact_rods_give_the_joint_bound() -> None:
         error = scan.error(joint.T_patient_model)
         against_bound.append(error @ np.linalg.solve(joint_bound(scan, frame, 0.2), error) / 6)
         against_own.append(error @ np.linalg.solve(joint.covariance, error) / 6)
-    allowed = 3 * np.sqrt(2 / 72)
+    allowed = 3 * np.sqrt(2 / 48)
     assert abs(np.mean(against_bound) - 1) < allowed
     assert abs(np.mean(against_own) - 1) < allowed
 
@@ -59,15 +59,15 @@ def test_a_frames_tolerance_does_not_average_out() -> None:
     """Error as large as the covariance says, and hardly smaller with three times the slices."""
     rng = np.random.default_rng(2)
     sds, normalised = [], []
-    for n_slices in (2, 5):
-        for _ in range(3):
+    for n_slices in (2, 4):
+        for _ in range(2):
             frame, scan = frame_and_scan(rng, tolerance_mm=0.3, n_slices=n_slices, sd_px=0.1)
             joint = register_joint(scan.slices, model_of(frame, tolerance_mm=0.3))
             error = scan.error(joint.T_patient_model)
             normalised.append(error @ np.linalg.solve(joint.covariance, error) / 6)
             sds.append(np.sqrt(np.trace(joint.covariance[:3, :3])))
-    assert 0.5 < np.mean(normalised) < 1 + 3 * np.sqrt(2 / 36)
-    assert np.median(sds[3:]) > 0.7 * np.median(sds[:3])
+    assert 0.5 < np.mean(normalised) < 1 + 3 * np.sqrt(2 / 24)
+    assert np.median(sds[2:]) > 0.7 * np.median(sds[:2])
 
 
 def test_every_row_is_the_joint_pose_in_its_own_axes() -> None:

@@ -31,14 +31,17 @@ def well_posed(rng: np.random.Generator, n: int, sd_px: float) -> tuple[oracle.O
     while True:
         frame = oracle.random_frame(rng, n, size=60.0, height=80.0)
         world = oracle.scene(rng, frame, sd_px=sd_px, mm_per_px=MM_PER_PX, least=n)
-        if world is None or np.linalg.eigvalsh(world.bound)[0] <= 0:  # four rods in one plane
+        if world is None:
+            continue
+        variance = np.linalg.eigvalsh(world.bound)
+        if variance[0] < 1e-12 * variance[-1]:  # four rods in one plane: a pseudo-inverse, no bound
             continue
         if np.sqrt(np.trace(world.bound[3:, 3:])) < MOST_SD_RAD:
             return frame, world
 
 
 @pytest.mark.parametrize(
-    ("n", "sd_px", "trials"), [(4, 0.05, 50), (5, 0.1, 40), (6, 0.3, 40), (9, 1.0, 20), (12, 0.05, 15)]
+    ("n", "sd_px", "trials"), [(4, 0.05, 30), (5, 0.1, 25), (6, 0.3, 25), (9, 1.0, 12), (12, 0.05, 10)]
 )
 def test_error_is_at_the_bound_and_the_covariance_true(n: int, sd_px: float, trials: int) -> None:
     rng = np.random.default_rng(100 * n)
@@ -61,14 +64,14 @@ def test_error_is_at_the_bound_and_the_covariance_true(n: int, sd_px: float, tri
 def test_scales_found_along_are_at_their_bound() -> None:
     rng = np.random.default_rng(3)
     normalised = []
-    while len(normalised) < 25:
+    while len(normalised) < 12:
         frame, world = well_posed(rng, 8, 0.1)
         (best, *_) = register_labelled(spots_of(world), world.rod_of_spot, model_of(frame), scale=None)
         assert best.scale is not None
         assert best.scale_covariance is not None
         error = best.scale.mm_per_px - world.mm_per_px
         normalised.append(error @ np.linalg.solve(best.scale_covariance, error) / 2)
-    assert abs(np.mean(normalised) - 1) < 3 * np.sqrt(1 / 25)
+    assert abs(np.mean(normalised) - 1) < 3 * np.sqrt(1 / 12)
 
 
 @pytest.mark.parametrize("n", [3, 4, 5])
