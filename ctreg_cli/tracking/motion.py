@@ -18,6 +18,7 @@ import numpy as np
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.plucker import skew
+from ctreg_cli.tracking.single import updated
 
 Prediction = Literal["velocity", "identity"]
 
@@ -93,7 +94,7 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     else:
         P[_POSE, _POSE] += spread * dt_s
     P[_POSE, _POSE] += _LEAST_STEP2 + _DOUBT2 * dt_s
-    return replace(state, T=poses.update(state.T, dt_s * state.velocity), covariance=P)
+    return replace(state, T=updated(state.T, dt_s * state.velocity), covariance=P)
 
 
 def correct(
@@ -115,7 +116,7 @@ def correct(
     P = predicted.covariance - gain @ predicted.covariance[:6]
     intensity, information = _learn(predicted, S_inverse, innovation, dt_s, kind)
     return MotionState(
-        T=poses.update(predicted.T, step[:6]),
+        T=updated(predicted.T, step[:6]),
         velocity=predicted.velocity + step[6:],
         covariance=0.5 * (P + P.T),
         intensity=intensity,

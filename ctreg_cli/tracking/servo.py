@@ -11,16 +11,15 @@ One pose at a time and the seen rods only, in closed forms: this is what a track
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
-from ctreg_cli.geometry import pose as poses
-from ctreg_cli.geometry.motion_field import motion_field
-from ctreg_cli.geometry.projection import project
 from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.rods import RodModel
+from ctreg_cli.tracking.single import cross, updated
 
 #: a step never turns the frame by more than this, rad
 _MAX_TURN_RAD = 0.5
@@ -54,6 +53,8 @@ class Desired:
     covariance_px: FloatArray
     #: (2,) ``[s_x, s_y]``; ones where the spots are given in millimetres
     mm_per_px: FloatArray
+    #: (k, 2, 2) inverse of ``covariance_px`` where that is all there is; None where tolerances add to it by the pose
+    weight: FloatArray | None = None
 
     @classmethod
     def of(
@@ -67,6 +68,7 @@ class Desired:
             uv_px=uv_px,
             covariance_px=covariance_px,
             mm_per_px=mm_per_px,
+            weight=None if model.tolerances.any() else invert_2x2(covariance_px),
         )
 
 
@@ -89,12 +91,13 @@ class View:
     def chi2(self) -> float:
         """Σ rᵀ W r."""
         r = self.residual_px
-        return float((r[:, None] @ self.weight @ r[:, :, None]).sum())
+        return float(((self.weight @ r[:, :, None])[:, :, 0] * r).sum())
 
     @property
     def rms_px(self) -> float:
         """Root mean square of the residuals over both coordinates."""
-        return float(np.sqrt(np.mean(self.residual_px**2)))
+        r = self.residual_px.ravel()
+        return math.sqrt(float(r @ r) / len(r))
 
     def weighted(self, jacobian: FloatArray) -> FloatArray:
         """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
@@ -104,23 +107,26 @@ class View:
 
 def view(desired: Desired, T: FloatArray) -> View:
     """The desired features from the pose ``T`` (4, 4); not finite where one of the rods lies in the slice."""
-    projection = project(T, desired.starts, desired.directions)
-    spots = projection.xy_mm / desired.mm_per_px
-    k = projection.slope
-    tolerance = k[:, :, None] * k[:, None, :]
-    tolerance[:, 0, 0] += 1.0
-    tolerance[:, 1, 1] += 1.0
-    tolerance *= (desired.tolerances**2)[:, None, None] / (desired.mm_per_px[:, None] * desired.mm_per_px)
-    covariance = desired.covariance_px + tolerance
-    J = motion_field(T, projection)
-    J /= desired.mm_per_px[:, None]
+    crossing = cross(T, desired.starts, desired.directions)
+    spots = crossing.xy_mm / desired.mm_per_px
+    covariance, weight = desired.covariance_px, desired.weight
+    if weight is None:
+        k = crossing.slope
+        tolerance = k[:, :, None] * k[:, None, :]
+        tolerance[:, 0, 0] += 1.0
+        tolerance[:, 1, 1] += 1.0
+        tolerance *= (desired.tolerances**2)[:, None, None] / (desired.mm_per_px[:, None] * desired.mm_per_px)
+        covariance = covariance + tolerance
+        weight = invert_2x2(covariance)
+    jacobian = crossing.jacobian
+    jacobian /= desired.mm_per_px[:, None]
     return View(
         spots_px=spots,
         residual_px=desired.uv_px - spots,
         covariance_px=covariance,
-        weight=invert_2x2(covariance),
-        jacobian=J.reshape(-1, 6),
-        lambda_mm=projection.lambda_mm,
+        weight=weight,
+        jacobian=jacobian.reshape(-1, 6),
+        lambda_mm=crossing.lambda_mm,
     )
 
 
@@ -195,32 +201,33 @@ def servo(
     converged, iterations = False, 0
     while not converged and iterations < options.max_iterations:
         step = options.gain * (J_plus @ here.residual_px.reshape(-1))  # the residual is s* − s
-        step *= min(1.0, _MAX_TURN_RAD / max(float(np.sqrt(step[3:] @ step[3:])), _MAX_TURN_RAD))
+        turn = math.sqrt(float(step[3:] @ step[3:]))
+        if turn > _MAX_TURN_RAD:
+            step *= _MAX_TURN_RAD / turn
         iterations += 1
-        T = poses.update(T, step)
+        T = updated(T, step)
         last, here = here, view(desired, T)
-        if not np.isfinite(here.residual_px).all():
+        if not math.isfinite(float(here.residual_px.sum())):
             raise np.linalg.LinAlgError("a rod came to lie in the slice")
         if jacobian is None:
             J_plus = pseudoinverse(here.jacobian, here)
         if keep_path:
             path.append((T, here.spots_px, stability_margin(J_plus, here.jacobian, model.size_mm)))
-        moved = float(np.abs(step * unit).max()) / model.size_mm
         d = here.spots_px - last.spots_px
-        moved_sd2 = float((d[:, None] @ here.weight @ d[:, :, None]).sum())
+        moved_sd2 = float(((here.weight @ d[:, :, None])[:, :, 0] * d).sum())
         converged = (
-            moved <= options.step_tolerance * options.gain
-            or moved_sd2 <= (options.spot_tolerance_sd * options.gain) ** 2
+            moved_sd2 <= (options.spot_tolerance_sd * options.gain) ** 2
+            or float(np.abs(step * unit).max()) <= options.step_tolerance * options.gain * model.size_mm
             or here.rms_px <= options.residual_tolerance
         )
     influence = J_plus
     if jacobian is not None:  # noise moves the pose where Ĵᵀ W r = 0 by (Ĵ⁺ J)⁻¹ Ĵ⁺
         influence = np.asarray(np.linalg.solve(J_plus @ here.jacobian, J_plus))
-    covariance = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
+    spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
     return ServoResult(
         T=T,
         view=here,
-        covariance=covariance.reshape(6, -1) @ influence.T,
+        covariance=spread.reshape(6, -1) @ influence.T,
         iterations=iterations,
         converged=converged,
         margin=stability_margin(J_plus, here.jacobian, model.size_mm) if converged else -np.inf,

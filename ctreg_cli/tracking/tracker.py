@@ -21,26 +21,24 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.design.symmetry import symmetries
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.geometry.motion_field import motion_field
-from ctreg_cli.geometry.projection import project
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import Matches, Scene, doubt, join, nearest_assignment, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, doubt, join, search, weigh
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.registration.register import LEAST_MATCHES, decide, make_scene
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
+from ctreg_cli.tracking.gate import GATE_SD, Outlook
 from ctreg_cli.tracking.prior import PastPrior
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.single import cross, difference
 from ctreg_cli.tracking.variants import covering, with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
 CONTINUES_D2 = 35.0
-#: gates about predicted spots, in sd
-GATE_SD = 4.5
 #: the margin below which a constant Jacobian is not trusted any more, and the most it may cost in variance
 LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 #: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
@@ -156,17 +154,17 @@ class Tracker:
         T = axes.slice_pose(moved.T)
         G = axes.slice_twist(T)
         covariance = G @ moved.pose_covariance @ G.T
-        projection = project(T, model.starts, model.directions)
-        J = np.nan_to_num(motion_field(T, projection))
+        crossing = cross(T, model.starts, model.directions)
+        J = crossing.jacobian
         reach = np.sqrt((J @ covariance * J).sum(axis=-1).max(axis=-1))
         # how far along a rod that moves the slice
-        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * np.sqrt(1 + (projection.slope**2).sum(axis=-1))
-        visible = (projection.lambda_mm >= -slack) & (projection.lambda_mm <= model.lengths + slack)
+        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * np.sqrt(1 + (crossing.slope**2).sum(axis=-1))
+        visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
         s = scale.mm_per_px
         return Prediction(
             T=T,
             covariance=covariance,
-            spots_px=projection.xy_mm / s,
+            spots_px=crossing.xy_mm / s,
             visible=visible,
             radius_px=GATE_SD * reach / float(s.min()),
             motion=moved,
@@ -262,8 +260,8 @@ class Tracker:
             return None, "no Jacobian has been kept yet"
         if len(scene.xy_mm) < CHECKABLE_MATCHES:
             return None, ""
-        spot_of_rod = nearest_assignment(model, scene, prediction.T[None], prediction.covariance)[0]
         T = prediction.T
+        spot_of_rod = Outlook(model, scene, T).assigned(prediction.covariance)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -277,14 +275,15 @@ class Tracker:
                 return None, "the spots do not determine the pose"
             if not moved.converged:
                 return None, "the servo did not converge"
-            again = nearest_assignment(model, scene, moved.T[None], moved.covariance)[0]
             T = moved.T
+            outlook = Outlook(model, scene, T)
+            again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):
                 break
             spot_of_rod = again
         else:
             return None, "the matches did not settle"
-        followed = _Followed(spot_of_rod=spot_of_rod, servo=moved)
+        followed = _Followed(spot_of_rod=spot_of_rod, servo=moved, outlook=outlook)
         if constant:
             if moved.margin < LEAST_MARGIN:
                 return followed, f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
@@ -297,8 +296,7 @@ class Tracker:
         self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
     ) -> Registration | None:
         return verified(
-            self.model,
-            scene,
+            followed.outlook,
             scale,
             spots,
             prediction.T,
@@ -391,7 +389,7 @@ class Tracker:
             agrees = len(scene.xy_mm) < CHECKABLE_MATCHES
             agrees |= any(continues(candidate, prediction) for candidate in verdict.candidates)
             if not agrees:
-                gated = nearest_assignment(self.model, scene, prediction.T[None], prediction.covariance)[0]
+                gated = Outlook(self.model, scene, prediction.T).assigned(prediction.covariance)
                 agrees = int((gated >= 0).sum()) >= _MATCHES_THAT_AGREE
             self._is_lost = True
             self.miss()
@@ -420,11 +418,10 @@ class Tracker:
             learnt = None if self._past is None else self._past.motion.intensity
             state = motion.start(T, C, kind, learnt)
         else:
-            innovation = poses.difference(T, prediction.motion.T)
+            innovation = difference(T, prediction.motion.T)
             state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind)
         if method == "registered":
-            projection = project(best.T_slice_model, model.starts, model.directions)
-            self._kept_jacobian = np.nan_to_num(motion_field(best.T_slice_model, projection))
+            self._kept_jacobian = np.nan_to_num(cross(best.T_slice_model, model.starts, model.directions).jacobian)
         tracked = Tracked(
             registration=sure,
             method="reacquired" if self._is_lost else method,
@@ -451,6 +448,7 @@ class _Followed:
     #: (n,) spot of each rod, −1 for none
     spot_of_rod: IntArray
     servo: ServoResult
+    outlook: Outlook
 
 
 def continues(candidate: Candidate, prediction: Prediction) -> bool:

@@ -17,18 +17,19 @@ from scipy.special import chdtrc, chdtri, gammaln
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.plucker import skew
-from ctreg_cli.geometry.projection import Projection, project
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
 from ctreg_cli.registration.integrity import protected_points
-from ctreg_cli.registration.matching import Scene, visibility
+from ctreg_cli.registration.matching import Scene
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MISS_P, fit_warnings, near_misses_p
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.gate import Outlook
 from ctreg_cli.tracking.servo import Desired, ServoResult, view
+from ctreg_cli.tracking.single import Crossing, difference
 
 #: matches that leave a redundancy to check by: four spots leave two equations, too few to contradict a false one
 CHECKABLE_MATCHES = 5
@@ -51,8 +52,7 @@ _TOUCHING_DIAMETERS, _TOUCHING_SIZE = 2.0, 0.05
 
 
 def verified(
-    model: RodModel,
-    scene: Scene,
+    outlook: Outlook,
     scale: Scale,
     spots: Spots,
     T_predicted: FloatArray,
@@ -64,8 +64,7 @@ def verified(
     """The verdict ``ok`` on a followed frame, or None where something is in doubt.
 
     Args:
-        model: the rods.
-        scene: the spots, mm.
+        outlook: what the pose expects of the slice.
         scale: mm per pixel.
         spots: the same spots, px.
         T_predicted: (4, 4) where the past expected the frame.
@@ -74,6 +73,7 @@ def verified(
         spot_of_rod: (n,) spot of each rod, −1 for none.
         options: the integrity risk, and the alert limit.
     """
+    model, scene = outlook.model, outlook.scene
     seen, T, C = moved.view, moved.T, moved.covariance
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
@@ -83,10 +83,13 @@ def verified(
         return None
     if _worst_turn(C) > VAGUE_POSE_RAD or _worst_turn(predicted_covariance) > VAGUE_PREDICTION_RAD:
         return None
-    projection = project(T, model.starts, model.directions)
-    may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
-    missing = np.nonzero(must & (spot_of_rod < 0))[0]
-    if not may[rods].all() or len(missing) > len(rods) or _touching(model, projection.xy_mm, rods, missing):
+    projection = outlook.crossing
+    missing = np.nonzero(outlook.must_be_seen & (spot_of_rod < 0))[0]
+    if (
+        not outlook.may_be_seen[rods].all()
+        or len(missing) > len(rods)
+        or _touching(model, projection.xy_mm, rods, missing)
+    ):
         return None
     if rod_end_shift_mm(model, rods, projection, scene.half_slab_mm) > 0:
         return None
@@ -96,7 +99,7 @@ def verified(
     protection = without.protection_mm(protected_points(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
         return None
-    innovation = poses.difference(T, T_predicted)
+    innovation = difference(T, T_predicted)
     S = predicted_covariance + C
     distance2 = float(innovation @ np.linalg.solve(S, innovation))
     if distance2 > _ODD_INNOVATION2:
@@ -171,7 +174,7 @@ def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntAr
     return int((gap2 < reach**2).sum()) > len(rods)  # each lies on itself
 
 
-def rod_end_shift_mm(model: RodModel, rods: IntArray, projection: Projection, half_slab_mm: float) -> float:
+def rod_end_shift_mm(model: RodModel, rods: IntArray, projection: Crossing, half_slab_mm: float) -> float:
     """How far in z a spot may lie off its crossing because a seen rod ends inside the slab, at most; mm."""
     rise = 1 / np.sqrt(1 + (projection.slope[rods] ** 2).sum(axis=1))
     to_end = np.minimum(projection.lambda_mm[rods], model.lengths[rods] - projection.lambda_mm[rods]) * rise

@@ -1,0 +1,45 @@
+"""One pose at a time is the same as one of a stack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.motion_field import motion_field
+from ctreg_cli.geometry.projection import project
+from ctreg_cli.tracking import single
+from tests.oracle import random_frame
+from tests.tracking.sequences import model_of
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_crossings_and_motion_field(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = model_of(random_frame(rng, 8))
+    T = poses.update(np.eye(4), np.concatenate([rng.normal(size=3) * 100, rng.normal(size=3)]))
+    crossing, projection = single.cross(T, model.starts, model.directions), project(T, model.starts, model.directions)
+    np.testing.assert_allclose(crossing.xy_mm, projection.xy_mm, rtol=1e-12)
+    np.testing.assert_allclose(crossing.lambda_mm, projection.lambda_mm, rtol=1e-12)
+    np.testing.assert_allclose(crossing.slope, projection.slope, rtol=1e-12)
+    np.testing.assert_allclose(crossing.jacobian, motion_field(T, projection), rtol=1e-12, atol=1e-12)
+
+
+def test_a_rod_in_the_slice_is_nan_and_no_warning() -> None:
+    crossing = single.cross(np.eye(4), np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    assert np.isnan(crossing.xy_mm[0]).all()
+    assert np.isfinite(crossing.xy_mm[1]).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-4, 0.3, 2.0, 3.1])
+def test_updates_and_differences(angle: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        twist = np.concatenate([rng.normal(size=3), angle * axis / np.linalg.norm(axis)])
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
+        moved = single.updated(T, twist)
+        np.testing.assert_allclose(moved, poses.update(T, twist), atol=1e-14)
+        np.testing.assert_allclose(single.difference(moved, T), twist, atol=1e-9 if angle > 3 else 1e-13)
