@@ -462,7 +462,7 @@ def table_wrong_model(share: float, seed: int) -> None:
         print(f"model wrong by 2 % ({what}), seed {seed}: {dict(tally)}")
 
 
-def table_leksell(share: float, seed: int) -> None:  # noqa: ARG001
+def table_leksell(share: float, seed: int) -> None:
     """Every slice of the real Leksell scan alone, against the rigid fit of all (only where the shared data are)."""
     import json
 

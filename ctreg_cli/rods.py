@@ -28,7 +28,7 @@ class Rod:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mount:
-    """How the frame normally sits: the rotation model → patient (LPS; slice axes where there is no patient geometry)."""
+    """How the frame normally sits: the rotation model → patient (LPS; slice axes without patient geometry)."""
 
     #: (3, 3)
     patient_from_model: FloatArray

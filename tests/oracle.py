@@ -46,7 +46,7 @@ class OracleScene:
 
 
 def cross_rod(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Where the segment from start to end crosses z = 0 (mm), and the share of its length there; None if it does not."""
+    """Where the segment from start to end crosses z = 0 (mm), and the share of its length there; or None."""
     a, b = R @ start + t, R @ end + t
     if (a[2] > 0) == (b[2] > 0) or a[2] == b[2]:
         return None
@@ -86,7 +86,7 @@ def bound(frame: OracleFrame, rods: list[int], R: np.ndarray, t: np.ndarray, s: 
 
 
 def random_frame(rng: np.random.Generator, n: int, size: float = 30.0, height: float = 40.0) -> OracleFrame:
-    """Rods from the rim of the bottom to the rim of the top of a box: half of them upright, half slanted along a side."""
+    """Rods from the rim of the bottom to the rim of the top of a box: half upright, half slanted along a side."""
 
     def rim(u: float) -> np.ndarray:
         side, along = int(4 * u) % 4, (4 * u) % 1 - 0.5

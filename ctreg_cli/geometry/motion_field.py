@@ -35,7 +35,7 @@ def motion_field(T: FloatArray, projection: Projection) -> FloatArray:
 
 
 def scaled_columns(J: FloatArray, size_mm: float) -> FloatArray:
-    """``J`` with its rotation columns divided by the frame's size: mm beside mm, so that rank and condition mean something."""
+    """``J`` with its rotation columns divided by the frame's size: mm beside mm, so that condition means something."""
     scaled = np.array(J, dtype=np.float64)
     scaled[..., 3:] /= size_mm
     return scaled

@@ -229,7 +229,7 @@ def _search_scales(
     first = slices[min(usable, key=lambda p: abs(len(slices[p].spots) - len(model)))]
     whole = min(len(first.spots), len(model))
     low, high = SCALE_RANGE
-    grid = np.geomspace(low, high, int(math.ceil(math.log(high / low) / math.log(_GRID_STEP))) + 1)
+    grid = np.geomspace(low, high, math.ceil(math.log(high / low) / math.log(_GRID_STEP)) + 1)
     tries = [(max(whole - 1, _LEAST_SPOTS), aspect) for aspect in _ASPECTS]
     if whole - 1 > _LEAST_SPOTS:
         tries.append((_LEAST_SPOTS, 1.0))
@@ -253,9 +253,7 @@ def _search_scales(
     return [], None
 
 
-def _odds_at(
-    item: SpotSlice, model: RodModel, scale: Scale, options: RegistrationOptions, least_matches: int
-) -> float:
+def _odds_at(item: SpotSlice, model: RodModel, scale: Scale, options: RegistrationOptions, least_matches: int) -> float:
     """ln odds of the best match of one slice at a grid scale."""
     scene = make_scene(
         _loosened(item.spots, model, scale, _SLACK_GRID),

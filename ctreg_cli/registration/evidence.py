@@ -1,10 +1,11 @@
 """How much a match is worth: its Bayesian odds against chance.
 
-As astrometry.net decides whether it has recognised a field of stars (Lang et al. 2010), a match is accepted for its odds,
-not for its residual. The two stories told about ``m`` spots in the frame's neighbourhood of area ``A``:
+As astrometry.net decides whether it has recognised a field of stars (Lang et al. 2010), a match is accepted for its
+odds, not for its residual. The two stories told about ``m`` spots in the frame's neighbourhood of area ``A``:
 
 * *chance*: all are clutter, scattered at an unknown density (Jeffreys' prior on it, integrated out);
-* *the frame is here*: at pose θ, ``n`` of the rods the slice cuts were seen (each with probability ``p``), with residuals
+* *the frame is here*: at pose θ, ``n`` of the rods the slice cuts were seen (each with probability ``p``), with
+residuals
   ``r_i ~ N(0, S_i)``; ``q`` were not; the other ``m − n`` spots are clutter.
 
 The pose is integrated out over its prior by Laplace's method, which charges a match for every pose it could have had:
@@ -14,8 +15,8 @@ The pose is integrated out over its prior by Laplace's method, which charges a m
 
 with C the pose covariance and π(θ) the prior density (uniform in position over the searched field; rotation: see
 :class:`PosePrior`). ``Γ(m + ½)/Γ(m − n + ½)`` is the number of ways to pick the n spots. Under *chance*
-the sum of E over all matches and poses has the mean 1, so by Markov's inequality a slice of pure clutter reaches ln E > x
-with a probability of at most exp(−x); ``benchmarks/accuracy.py`` measures it.
+the sum of E over all matches and poses has the mean 1, so by Markov's inequality a slice of pure clutter reaches ln E
+> x with a probability of at most exp(−x); ``benchmarks/accuracy.py`` measures it.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ _NEIGHBOURHOOD = 1.25
 class PosePrior:
     """What is known of the pose before looking at the spots.
 
-    Either a cone of rotations about a nominal one (the frame's mount), every one in it alike; or nothing but that a frame
-    is built to be cut across its rods: the tilt of their common axis against the slice normal is small more often than not.
-    Any other pose stays possible.
+    Either a cone of rotations about a nominal one (the frame's mount), every one in it alike; or nothing but that a
+    frame is built to be cut across its rods: the tilt of their common axis against the slice normal is small more often
+    than not. Any other pose stays possible.
     """
 
     #: (3, 3) nominal rotation model → slice; None: any
@@ -114,7 +115,8 @@ def log_odds(
         matched: (b, n) rods with a spot.
         expected: (b, n) rods that would have to be seen, matched or not.
         brightness: (m,) contrast of every spot, where it was measured, with
-        spot_of_rod: (b, n) the spot of each rod: clutter much fainter than any matched spot could not have been taken for it,
+        spot_of_rod: (b, n) the spot of each rod: clutter much fainter than any matched spot could not have been taken
+        for it,
             and does not count.
         log_prior_density: (b,) ln π(θ) where a prediction says more than ``prior`` (tracking), per mm³ rad³.
     """
@@ -138,7 +140,8 @@ def log_odds(
 
     H, _ = fit.normal_equations()
     C, _ = covariance_from_information(H, model.size_mm)
-    # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not 10⁶
+    # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not
+    # 10⁶
     log_prior = prior.log_density(T[:, :3, :3]) - np.log(field * 2 * model.size_mm)
     if log_prior_density is not None:
         log_prior = log_prior_density

@@ -1,14 +1,15 @@
 """How wrong can it be? Protection levels, as aviation asks of a navigator (RAIM by solution separation).
 
-For each target, ``pl_mm`` is a distance the true error exceeds with at most the stated risk, even if one of the matched spots
-is faulty and nothing showed it (a streak, a neighbour, a bent rod). If spot k is the faulty one, the solution without it is
-sound, and the triangle inequality bounds the error of the full one:
+For each target, ``pl_mm`` is a distance the true error exceeds with at most the stated risk, even if one of the
+matched spots is faulty and nothing showed it (a streak, a neighbour, a bent rod). If spot k is the faulty one, the
+solution without it is sound, and the triangle inequality bounds the error of the full one:
 
     |x − x_true| ≤ |x − x_k| + |x_k − x_true|,     |x_k − x_true| ≤ K σ_k   but for the risk,
 
 with x_k the leave-one-rod-out solution, σ_k the largest standard deviation of its target error in any direction, and
-``K² = χ²₃⁻¹(1 − risk / (n + 1))``: the risk is shared between the n possible faults and none. A fault is taken as certain, not
-as rare. With fewer than five matches the solutions left over cannot be told from others: the level is infinite.
+``K² = χ²₃⁻¹(1 − risk / (n + 1))``: the risk is shared between the n possible faults and none. A fault is taken as
+certain, not as rare. With fewer than five matches the solutions left over cannot be told from others: the level is
+infinite.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def protection_levels(
 
 
 def _largest_sd(C: FloatArray, arms: FloatArray) -> FloatArray:
-    """(b, p) largest standard deviation, in any direction, of points at ``arms`` (b, p, 3) from the model origin, mm."""
+    """(b, p) largest sd, in any direction, of points at ``arms`` (b, p, 3) from the model origin, mm."""
     G = np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape[:-1], 3, 3)), -skew(arms)], axis=-1)
     values = np.linalg.eigvalsh(G @ C[:, None] @ np.swapaxes(G, -1, -2))
     result: FloatArray = np.sqrt(np.maximum(values[..., -1], 0))

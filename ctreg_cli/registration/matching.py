@@ -1,7 +1,9 @@
 """Which spot is which rod, without labels: hypothesise, predict, bound λ, verify.
 
-1. *Hypothesise.* Rod triples, ordered so that a short prefix contains a triple of any large set of rods, against ordered
-   spot triples whose distances the bounded rods can show; :func:`~ctreg_cli.registration.minimal.scan_three` gives poses.
+1. *Hypothesise.* Rod triples, ordered so that a short prefix contains a triple of any large set of rods, against
+ordered
+   spot triples whose distances the bounded rods can show; :func:`~ctreg_cli.registration.minimal.scan_three` gives
+   poses.
 2. *Predict.* Each pose says where every other rod crosses the slice, and how well it knows (the covariance of the three
    spots, propagated); the nearest spot votes if it lies within that gate.
 3. *Verify.* The best-voted poses are refined on all their spots, vote again with the smaller covariance, and are ranked
@@ -245,8 +247,8 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
 def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
     """Whether a match of only ``k`` spots can come near the odds of the best one found.
 
-    Against the best it lacks the worth of n − k matches, and owes for as many missed rods; it may gain all of the best's
-    residual, and some volume of poses for knowing them less well.
+    Against the best it lacks the worth of n − k matches, and owes for as many missed rods; it may gain all of the
+    best's residual, and some volume of poses for knowing them less well.
     """
     matched = best.spot_of_rod[0] >= 0
     n, m = int(matched.sum()), len(scene.xy_mm)
@@ -263,7 +265,7 @@ def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
 def _search_triple(
     model: RodModel, scene: Scene, rods: IntArray, least_matches: int, seen: set[bytes]
 ) -> Matches | None:
-    """Poses from one rod triple against all spot triples, voted, refined and weighed; ``seen``: match sets already weighed."""
+    """Poses from one rod triple against all spot triples, voted and weighed; ``seen``: match sets already weighed."""
     layout = plan(model)
     noise = _noise_mm(model, scene)
     kept: list[tuple[FloatArray, FloatArray, IntArray]] = []
@@ -500,7 +502,7 @@ def nearest_assignment(model: RodModel, scene: Scene, T: FloatArray, covariance:
 
 
 def distinct(model: RodModel, matches: Matches, *, within: float = _KEEP_WITHIN, most: int = 24) -> Matches:
-    """The best of each pose: hypotheses that are within ``within`` nats of the best and differ in pose or in matches."""
+    """The best of each pose: hypotheses within ``within`` nats of the best that differ in pose or in matches."""
     keep: list[int] = []
     for i in range(len(matches)):
         if matches.log_odds[i] < matches.log_odds[0] - within or len(keep) >= most:

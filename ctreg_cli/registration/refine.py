@@ -1,9 +1,9 @@
 """Weighted Gauss–Newton on the spots: the estimate that sits at the Cramér–Rao bound, and its covariance.
 
-Minimised is Σ rᵀ W r over the twist, r = measured − predicted spot in pixels, with ``W⁻¹`` = the spot's own covariance plus
-what the frame's ``tolerance`` τ allows: a rod displaced by δ across itself shifts its spot by ``[I₂ | −k] δ``, covariance
-``τ² (I₂ + k kᵀ)``. Everything works on a stack of ``b`` hypotheses at once, each with a spot (or none) for each of the
-``n`` rods, because the matcher has thousands of them.
+Minimised is Σ rᵀ W r over the twist, r = measured − predicted spot in pixels, with ``W⁻¹`` = the spot's own
+covariance plus what the frame's ``tolerance`` τ allows: a rod displaced by δ across itself shifts its spot by ``[I₂ |
+−k] δ``, covariance ``τ² (I₂ + k kᵀ)``. Everything works on a stack of ``b`` hypotheses at once, each with a spot (or
+none) for each of the ``n`` rods, because the matcher has thousands of them.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ def invert_2x2(matrices: FloatArray) -> FloatArray:
 def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, half_slab_mm: float) -> FloatArray:
     """How far along ``slope`` (..., n) mm of z a spot may lie off its crossing because the rod ends inside the slab.
 
-    The spot is the mean of what metal the slab holds. Where a length of the slab's height is empty, its middle lies half
-    that length off the mid-plane, and the spot as much times the slope.
+    The spot is the mean of what metal the slab holds. Where a length of the slab's height is empty, its middle lies
+    half that length off the mid-plane, and the spot as much times the slope.
     """
     rise = 1 / np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of z per mm of rod
     below = np.clip(half_slab_mm - lambda_mm * rise, 0, 2 * half_slab_mm)
@@ -119,7 +119,7 @@ def spot_covariance(
     mm_per_px: FloatArray,
     shift_mm: FloatArray | None = None,
 ) -> FloatArray:
-    """Covariance (..., n, 2, 2) in px² of measured minus predicted spots: spot noise, the frame's tolerance, rod ends."""
+    """Covariance (..., n, 2, 2) in px² of measured minus predicted spots: noise, the frame's tolerance, rod ends."""
     scale = mm_per_px[..., None, :]
     k = slope / scale
     extra = k[..., :, None] * k[..., None, :]
@@ -201,8 +201,8 @@ def refine(
 def covariance_from_information(H: FloatArray, size_mm: float) -> tuple[FloatArray, FloatArray]:
     """Pose covariances (..., 6, 6) and condition numbers (...,) from information matrices.
 
-    Rotation is measured in frame sizes while judging rank; a direction the spots say nothing of gets an infinite condition
-    and a huge, finite variance (10⁶ mm²), so that it shows instead of being lost.
+    Rotation is measured in frame sizes while judging rank; a direction the spots say nothing of gets an infinite
+    condition and a huge, finite variance (10⁶ mm²), so that it shows instead of being lost.
     """
     unit = np.array([1, 1, 1, *(3 * [1 / size_mm])])
     values, vectors = np.linalg.eigh(H * (unit[:, None] * unit))
@@ -240,13 +240,15 @@ def refine_scales(
     prior_sd: FloatArray | None = None,
     iterations: int = 50,
 ) -> ScaleFit:
-    """Minimise χ² over the poses of ``b`` slices *and* the pixel scales they share (``observations.mm_per_px`` starts them).
+    """Minimise χ² over the poses of ``b`` slices *and* the pixel scales they share (``observations.mm_per_px`` starts
+    them).
 
     The normal equations are an arrow: a 6 × 6 block a slice, and two columns all slices share, eliminated by the Schur
     complement. The scales move in their logarithms, so that they stay positive.
 
-    A frame's ``tolerance`` is a constant error of each rod: it does not average out over slices. It is therefore estimated
-    along, two more shared unknowns a rod with the tolerance as prior, not treated as fresh noise in every slice.
+    A frame's ``tolerance`` is a constant error of each rod: it does not average out over slices. It is therefore
+    estimated along, two more shared unknowns a rod with the tolerance as prior, not treated as fresh noise in every
+    slice.
     """
     n = len(model)
     loose = model.tolerances > 0

@@ -25,11 +25,11 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
-#: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed this
-#: (ln): chance is a rival like any other ...
+#: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed
+#: this (ln): chance is a rival like any other ...
 ACCEPT_LOG_ODDS = math.log(100)
-#: ... and more for each spot left over: in dense clutter chance matches crowd up to what Markov's inequality allows them,
-#: among few spots they stay far below (measured by benchmarks/accuracy.py, table ``clutter``)
+#: ... and more for each spot left over: in dense clutter chance matches crowd up to what Markov's inequality allows
+#: them, among few spots they stay far below (measured by benchmarks/accuracy.py, table ``clutter``)
 ACCEPT_LOG_ODDS_PER_FREE_SPOT = 0.12
 #: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
 ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
@@ -117,8 +117,8 @@ def register(
         options: see :class:`RegistrationOptions`.
 
     Returns:
-        The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²), leaves
-        no more rods unexplained than it explains, and no other pose comes within odds of 100 : 1.
+        The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²),
+        leaves no more rods unexplained than it explains, and no other pose comes within odds of 100 : 1.
     """
     options = options or RegistrationOptions()
     scene = make_scene(
@@ -240,11 +240,12 @@ def decide(
 
 
 def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
-    """Probability that chance puts unmatched spots as near the places of missing rods as they are; 1 if none are missing.
+    """Probability that chance puts unmatched spots as near the places of missing rods as they are; 1 if none are
+    missing.
 
-    When spots are worse than they say, or the frame is not its drawing, a few of the rods can always be made to fit, and
-    the others lie just beside their places. One such spot is forgiven (a streak, a neighbour moved it), two are a pattern:
-    Fisher's method over the distances to the nearest free spot, the smallest left out.
+    When spots are worse than they say, or the frame is not its drawing, a few of the rods can always be made to fit,
+    and the others lie just beside their places. One such spot is forgiven (a streak, a neighbour moved it), two are a
+    pattern: Fisher's method over the distances to the nearest free spot, the smallest left out.
     """
     if len(best.missing_rods) < 2:
         return 1.0
@@ -273,8 +274,8 @@ def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
 def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool:
     """Whether more spots become rods, at better odds, once the spots (or the frame) may be a few percent off.
 
-    With a wrong scale or a frame that is not its drawing the true match does not fit, and a chance match of a few of its
-    spots is what remains; it must not pass for the pose.
+    With a wrong scale or a frame that is not its drawing the true match does not fit, and a chance match of a few of
+    its spots is what remains; it must not pass for the pose.
     """
     slack = (_LOOSE_SHARE * model.size_mm) ** 2
     loose = replace(scene, covariance_mm=scene.covariance_mm + slack * np.eye(2))
@@ -383,8 +384,8 @@ def assemble_candidate(
 def _hangs_on_one_spot(best: Candidate, c: Candidate) -> bool:
     """Whether ``c`` is ``best`` without one spot, at a pose that contradicts it.
 
-    Where spots are false, one of them can complete a wrong pose out of true ones, at odds no density of clutter foresees
-    (one in some thousand scenes measured): a pose that a single spot decides needs more than 100 : 1.
+    Where spots are false, one of them can complete a wrong pose out of true ones, at odds no density of clutter
+    foresees (one in some thousand scenes measured): a pose that a single spot decides needs more than 100 : 1.
     """
     one_less = len(c.rod_index) == len(best.rod_index) - 1 and _matches(c) < _matches(best)
     return one_less and not _knows_less(c, best) and pose_distance_sd(best, c) > RIVAL_SD
@@ -395,7 +396,7 @@ def _matches(c: Candidate) -> set[tuple[int, int]]:
 
 
 def _knows_less(c: Candidate, best: Candidate) -> bool:
-    """Whether ``c`` is ``best`` with fewer matches, and does not contradict it: its own, wider covariance covers both."""
+    """Whether ``c`` is ``best`` with fewer matches, and does not contradict it: its wider covariance covers both."""
     if not _matches(c) < _matches(best):
         return False
     twist = poses.difference(c.T_slice_model, best.T_slice_model)
@@ -406,8 +407,8 @@ def _knows_less(c: Candidate, best: Candidate) -> bool:
 def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
     """``best`` with a covariance that covers the variants of its own match: Bayesian model averaging about its pose.
 
-    A variant without the one spot that fixes a direction (``doubts``) contradicts nothing, but if it is the truth, the error
-    is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``, the weights w from the odds.
+    A variant without the one spot that fixes a direction (``doubts``) contradicts nothing, but if it is the truth,
+    the error is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``, the weights w from the odds.
 
     Returns the candidate and the weight of all variants together.
     """

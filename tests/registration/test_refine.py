@@ -118,7 +118,7 @@ def test_a_rod_that_ends_in_the_slab_counts_for_less() -> None:
 
 
 def test_weights_follow_the_spots_covariances() -> None:
-    """Spots known ten times worse in u move the pose as much less: the estimate is the weighted one, not the plain one."""
+    """Spots known worse in u move the pose less: the estimate is the weighted minimum, not the plain one."""
     rng = np.random.default_rng(915)
     frame = random_frame(rng, 8, 60, 80)
     world = some_scene(rng, frame, sd_px=0.2, least=8)
