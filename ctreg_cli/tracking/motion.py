@@ -49,8 +49,8 @@ class MotionState:
     #: (2,) intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
     intensity: FloatArray
     information: FloatArray
-    #: slices that have gone into it
-    n_slices: int = 1
+    #: time that the motion has been watched for
+    elapsed_s: float = 0.0
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -121,7 +121,7 @@ def correct(
         covariance=0.5 * (P + P.T),
         intensity=intensity,
         information=information,
-        n_slices=predicted.n_slices + 1,
+        elapsed_s=predicted.elapsed_s + dt_s,
     )
 
 

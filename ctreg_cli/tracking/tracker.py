@@ -246,6 +246,8 @@ class Tracker:
         past = self._past
         if past is None or past.n_missed or not np.array_equal(spots.uv_px, past.spots_px):
             return None
+        if past.info.scale != info.scale or past.info.thickness_mm != info.thickness_mm:
+            return None
         here, there = past.info.T_patient_slice, info.T_patient_slice
         if here is not None and there is not None and not np.array_equal(here, there):
             return None
@@ -434,8 +436,8 @@ class Tracker:
         return tracked
 
     def _velocity(self, state: motion.MotionState, T_slice_model: FloatArray, info: SliceInfo) -> Velocity | None:
-        """The middle's velocity as the model origin's, slice axes; None after one slice only, or without times."""
-        if self.options.prediction == "identity" or info.time_s is None or state.n_slices < 2:
+        """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known."""
+        if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
         G = self._axes(info).slice_twist(T_slice_model)
         return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
