@@ -201,11 +201,18 @@ def track(
         segmentation: see :class:`SegmentationOptions`.
 
     Raises:
-        MissingScaleError: a slice has no scale and none was given.
+        MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
     """
     segmentation = segmentation or SegmentationOptions()
     tracker = Tracker(model, options)
+    seen_scale = scale is not None
     for place, slice_ in enumerate(slices):
+        seen_scale |= slice_.info.scale is not None
+        if seen_scale and scale is None and slice_.info.scale is None and not getattr(slice_, "problem", ""):
+            tracker.miss()
+            item = spots_of(slice_, segmentation)
+            yield failure(place if item.index is None else item.index, item, "no_scale")
+            continue
         yield track_slice(place, slice_, tracker, scale=scale, segmentation=segmentation)
 
 
@@ -324,7 +331,8 @@ def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
     scale = override or item.info.scale
     if scale is None:
         raise MissingScaleError(
-            f"{item.info.source}: no pixel scale in the input; give --scale SX SY (mm per pixel) or -c CALIBRATION"
+            f"{item.info.source or 'spots'}: no pixel scale in the input; "
+            "give --scale SX SY (mm per pixel) or -c CALIBRATION"
         )
     return scale
 

@@ -1,8 +1,9 @@
 """Pixel scales from slices of a known frame: labels unknown, scales unknown (Doignon et al. 2008, §2, eq. 6).
 
-One slice bounds a scale to about a percent, so all slices are solved jointly: shared s_x and s_y, one pose each, and where
-the frame has a ``tolerance``, one shared displacement a rod. Labels come from the matcher, which wants a scale: DICOM's
-PixelSpacing is tried first, and where there is none or it does not fit, a logarithmic grid over every scale a scanner has.
+One slice bounds a scale to about a percent, so all slices are solved jointly: shared s_x and s_y, one pose each, and
+where the frame has a ``tolerance``, one shared displacement a rod. Labels come from the matcher, which wants a scale:
+DICOM's PixelSpacing is tried first, and where there is none or it does not fit, a logarithmic grid over every scale a
+scanner has.
 """
 
 from __future__ import annotations
@@ -127,9 +128,11 @@ def _common_nominal(slices: Sequence[SpotSlice], usable: list[int]) -> Scale | N
     scales = {(s.s_x, s.s_y) for s in (slices[place].info.scale for place in usable) if s is not None}
     if len(scales) > 1:
         raise CalibrationError(
-            f"the slices have {len(scales)} different PixelSpacings; calibrate one reconstruction at a time (--series N)"
+            f"the slices have {len(scales)} different PixelSpacings; calibrate one reconstruction at a time (--series)"
         )
-    return Scale(s_x=scales.copy().pop()[0], s_y=scales.pop()[1]) if scales else None
+    for s_x, s_y in scales:
+        return Scale(s_x=s_x, s_y=s_y)
+    return None
 
 
 def _fit_from(
@@ -222,8 +225,8 @@ def _search_scales(
 ) -> tuple[list[_Labelled], ScaleFit | None]:
     """Walk the grid of scales on one slice; the scale that explains most, confirmed on all slices, wins.
 
-    Nearly all rods seen is the quick and likely case and is tried for every aspect ratio first; a match of few of them is
-    looked for with square pixels only.
+    Nearly all rods seen is the quick and likely case and is tried for every aspect ratio first; a match of few of them
+    is looked for with square pixels only.
     """
     # most spots of the frame and least clutter: near the frame's own number of rods
     first = slices[min(usable, key=lambda p: abs(len(slices[p].spots) - len(model)))]

@@ -351,7 +351,7 @@ def _vote(
     nearest = gap2.argmin(axis=2)
     r = scene.xy_mm[nearest] - xy
     distance2 = np.einsum("bni,bnij,bnj->bn", r, invert_2x2(gate), r)
-    spread = np.sqrt(np.linalg.det(gate))
+    spread = np.sqrt(np.maximum(np.linalg.det(gate), 1e-300))
     votes = seen & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
     votes[:, rods] = False
     density = len(scene.xy_mm) / max(float(np.prod(np.ptp(scene.xy_mm, axis=0))), 1e-9)
@@ -615,6 +615,17 @@ def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_match
         swap[np.arange(len(matched)), matched] = gap.argmin(axis=1)
         variants.append(swap[near])
         starts.append(T_without[near])
+        # the spot just dropped, given to another rod that crosses beside it (an upright and a diagonal where they meet)
+        crossing = np.nan_to_num(fit.predicted_px, nan=np.inf)
+        beside = np.linalg.norm(crossing - scene.xy_mm[spot_of_rod[matched]][:, None], axis=-1)
+        beside = np.where(without < 0, beside, np.inf)
+        beside[np.arange(len(matched)), matched] = np.inf
+        which, other = np.nonzero(beside < _WIDEST_GATE * model.size_mm)
+        if len(which):
+            relabelled = without[which]
+            relabelled[np.arange(len(which)), other] = spot_of_rod[matched[which]]
+            variants.append(relabelled)
+            starts.append(T_without[which])
     variants_all = np.concatenate(variants) if variants else np.empty((0, len(model)), dtype=np.intp)
     starts_all = np.concatenate(starts) if starts else np.empty((0, 4, 4))
     return weigh(model, scene, starts_all, variants_all, least_matches)

@@ -52,6 +52,8 @@ _WORTH_SAYING = 1e-3
 #: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
 #: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
+#: χ² that three sd must cost at the least (a straight cost: 9); under it no ellipsoid describes what is known
+_LEAST_RISE = 4.0
 #: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
 _LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
 #: matches below which nothing can be checked: three spots always fit
@@ -224,6 +226,8 @@ def decide(
             ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
         )
     best = protected(model, scene, best, options)
+    if not rivals and len(best.rod_index) > LEAST_MATCHES and np.isinf(best.protection_mm).any():
+        return refused("unprotected")  # without one of its spots nothing would be known: that spot is the pose
     if options.alert_limit_mm is not None and not rivals and best.protection_mm.max() > options.alert_limit_mm:
         return refused("unprotected")
     warnings.extend(fit_warnings(model, spots, best))
@@ -460,8 +464,8 @@ def widen_where_curved(
 ) -> tuple[Candidate | None, float]:
     """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
 
-    Returns the candidate and the factor (1 when all is well), or None when a step of 3 sd costs next to nothing: then
-    no ellipsoid describes what is known.
+    Returns the candidate and the factor (1 when all is well), or None when a step of 3 sd costs too little: then no
+    ellipsoid describes what is known.
     """
     unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
     values, vectors = np.linalg.eigh(best.covariance / best.inflation**2 * (unit[:, None] * unit))
@@ -487,7 +491,7 @@ def widen_where_curved(
     least = float(np.min(np.where(np.isfinite(rise), rise, 9.0)))
     if least > 0.6 * 9:
         return best, 1.0
-    if least < 1.0:
+    if least < _LEAST_RISE:
         return None, math.inf
     factor = 3 / math.sqrt(least)
     widened = (

@@ -242,3 +242,35 @@ def test_bound_of_the_oracle_is_the_covariance_of_the_package() -> None:
     best = registered(world, CUBE).candidates[0]
     expected = bound(frame_of(CUBE), sorted(best.rod_index.tolist()), world.R, world.t, world.mm_per_px, 0.001)
     np.testing.assert_allclose(best.covariance, expected, rtol=0.01, atol=1e-12)
+
+
+def test_a_spot_beside_two_rods_is_tried_with_both() -> None:
+    """An upright and a diagonal cross a few pixels apart, and only one of them is seen: the true one has better odds."""
+    rng = np.random.default_rng(816)
+    model = load_rod_model("leksell-g-3-panel")
+    assert model.mount is not None
+    wrong = checked = 0
+    for _ in range(12):
+        R = poses.exp_rotation(rng.normal(size=3) * 0.06) @ np.asarray(model.mount.patient_from_model)
+        # near the panels' lower corners, where R2 runs into R3 and L2 into L3
+        inside = model.centre + np.array([0, 0, rng.uniform(-52, -44)])
+        t = np.array([150.0, 140.0, 0.0]) - R @ inside
+        rods, uv = [], []
+        for i, (a, b) in enumerate(zip(model.starts, model.ends, strict=True)):
+            p, q = R @ a + t, R @ b + t
+            if (p[2] > 0) != (q[2] > 0) and i not in (2, 4):
+                rods.append(i)
+                uv.append((p + p[2] / (p[2] - q[2]) * (q - p))[:2] / 0.6)
+        result = register(
+            Spots.from_points(np.array(uv) + rng.normal(size=(len(uv), 2)) * 0.05, 0.05),
+            model,
+            scale=Scale(s_x=0.6, s_y=0.6),
+        )
+        if result.status == "ok":
+            checked += 1
+            error = twist_error(
+                result.candidates[0].T_slice_model[:3, :3], result.candidates[0].T_slice_model[:3, 3], R, t
+            )
+            wrong += bool(error @ np.linalg.inv(result.candidates[0].covariance) @ error > 36)
+    assert wrong == 0
+    assert checked >= 3
