@@ -58,7 +58,7 @@ def test_more_slices_know_more() -> None:
 
 def test_clutter_has_no_scale() -> None:
     rng = np.random.default_rng(923)
-    uv = 250 + rng.uniform(-60, 60, (7, 2))
+    uv = 250 + rng.uniform(-60, 60, (5, 2))
     item = SpotSlice(info=SliceInfo(source="oracle", scale=Scale(s_x=0.5, s_y=0.5)), spots=Spots.from_points(uv, 0.05))
     with pytest.raises(CalibrationError, match="no scale between"):
         calibrate([item], CUBE)

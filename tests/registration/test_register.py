@@ -245,7 +245,7 @@ def test_bound_of_the_oracle_is_the_covariance_of_the_package() -> None:
 
 
 def test_a_spot_beside_two_rods_is_tried_with_both() -> None:
-    """An upright and a diagonal cross a few pixels apart, and only one of them is seen: the true one has better odds."""
+    """An upright and a diagonal cross a few pixels apart, and only one of them is seen: the true one is found."""
     rng = np.random.default_rng(816)
     model = load_rod_model("leksell-g-3-panel")
     assert model.mount is not None
