@@ -19,7 +19,7 @@ from ctreg_cli.registration.refine import covariance_from_information
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
 
-#: a free rod whose crossing lies this near a spot (in frame sizes) could be the spot's
+#: a rod whose crossing lies this near a spot (in frame sizes) could be the spot's
 _NEAR_SIZES = 0.15
 #: a match that moves the pose by more than this (χ² of six degrees of freedom) must be better supported than
 #: 1000 : 1 (ln), or the covariance has to cover the pose without it
@@ -27,17 +27,21 @@ _INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 7.5
 
 
 def with_other_rods(model: RodModel, scene: Scene, matches: Matches, least_matches: int) -> Matches:
-    """``matches`` and, for the best of them, those with a spot given to a free rod that crosses near it."""
+    """``matches`` and, for the best of them, those in which two rods that cross near a spot exchange what they have.
+
+    One of them has the spot, the other another one, or none.
+    """
     spot_of_rod = matches.spot_of_rod[0]
     crossing = project(matches.T[0], model.starts, model.directions).xy_mm
-    free = np.nonzero((spot_of_rod < 0) & np.isfinite(crossing).all(axis=1))[0]
     taken = np.nonzero(spot_of_rod >= 0)[0]
-    gap = np.linalg.norm(crossing[free, None] - scene.xy_mm[spot_of_rod[taken]], axis=-1)
+    gap = np.linalg.norm(np.nan_to_num(crossing, nan=np.inf)[:, None] - scene.xy_mm[spot_of_rod[taken]], axis=-1)
     variants: list[IntArray] = []
-    for i, j in zip(*np.nonzero(gap < _NEAR_SIZES * model.size_mm), strict=True):
-        other = spot_of_rod.copy()
-        other[free[i]], other[taken[j]] = spot_of_rod[taken[j]], -1
-        variants.append(other)
+    for rod, j in zip(*np.nonzero(gap < _NEAR_SIZES * model.size_mm), strict=True):
+        has_it = taken[j]
+        if rod < has_it or spot_of_rod[rod] < 0:  # each pair once
+            other = spot_of_rod.copy()
+            other[[rod, has_it]] = spot_of_rod[[has_it, rod]]
+            variants.append(other)
     if not variants:
         return matches
     found = weigh(model, scene, np.repeat(matches.T[:1], len(variants), axis=0), np.stack(variants), least_matches)

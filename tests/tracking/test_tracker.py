@@ -43,9 +43,9 @@ def clean(kind: str = "breathing", n: int = 30, seed: int = 5, **options: object
 
 
 @pytest.mark.parametrize("strategy", ["updated", "constant"])
-@pytest.mark.parametrize("kind", ["breathing", "drift", "jumps"])
+@pytest.mark.parametrize("kind", ["breathing", "jumps"])
 def test_rods_missing_and_spots_false(kind: str, strategy: str) -> None:
-    made = sequence(2, kind=kind, n=30, model=CUBE, sd_px=0.1)
+    made = sequence(2, kind=kind, n=26, model=CUBE, sd_px=0.1)
     results = track(made, jacobian=strategy)
     assert not wrong(results, made)
     decidable = [i for i, true in enumerate(made.truth) if len(true.rods) >= 5 and worst_turn_deg(true.bound) < 2]
@@ -81,9 +81,9 @@ def test_a_constant_jacobian_is_renewed_when_it_no_longer_serves_and_says_why() 
     assert all("registered_anew" in dict(r.warnings) for r in renewed)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_jump_is_found_again_in_the_slice_after_which_it_can_be(seed: int) -> None:
-    made = clean("jumps", n=40, seed=seed)
+    made = clean("jumps", n=24, seed=seed)
     results = track(made)
     assert not wrong(results, made)
     for i, true in enumerate(made.truth):
@@ -169,7 +169,7 @@ def half_turned(frame: OracleFrame) -> OracleFrame:
 
 def test_a_symmetric_frame_without_a_mount_is_never_sure() -> None:
     frame = half_turned(random_frame(np.random.default_rng(4), 4))
-    made = sequence(1, kind="breathing", n=12, frame=frame, sd_px=0.1, p_missing=0.0, most_false=0)
+    made = sequence(1, kind="breathing", n=8, frame=frame, sd_px=0.1, p_missing=0.0, most_false=0)
     results = track(made)
     assert {r.status for r in results} == {"ambiguous"}
 
@@ -291,14 +291,14 @@ def test_a_table_that_moves_is_taken_out() -> None:
 
 
 def test_the_covariance_is_true() -> None:
-    made = sequence(21, kind="breathing", n=60, model=CUBE, sd_px=0.1, p_missing=0.1, most_false=1)
+    made = sequence(21, kind="breathing", n=48, model=CUBE, sd_px=0.1, p_missing=0.1, most_false=1)
     nees = []
     for result, true in zip(track(made), made.truth, strict=True):
         if result.status == "ok":
             best = result.candidates[0]
             error = error_of(best.T_slice_model, true)
             nees.append(error @ np.linalg.solve(best.covariance, error))
-    assert len(nees) > 50
+    assert len(nees) > 40
     assert 4.5 < np.mean(nees) < 7.5
 
 
@@ -317,3 +317,12 @@ def test_the_alert_limit_holds_for_tracked_poses_too() -> None:
 def test_model_of_and_frame_of_are_inverse() -> None:
     frame = random_frame(np.random.default_rng(0), 5)
     np.testing.assert_array_equal(frame_of(model_of(frame)).starts, frame.starts)
+
+
+def test_two_rods_whose_spots_lie_side_by_side_are_not_exchanged() -> None:
+    """Rods 0 and 2 of this frame cross each other's way: with their spots exchanged the fit is nearly as good."""
+    whole = sequence(100, n=150)
+    made = Sequence(whole.frame, whole.model, whole.slices[60:68], whole.truth[60:68])
+    results = track(made)
+    assert not wrong(results, made)
+    assert sum(r.status == "ok" for r in results) >= 4
