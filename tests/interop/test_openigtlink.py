@@ -169,7 +169,7 @@ def test_dead_many_and_chattering_clients() -> None:
             connection.close()
         crowd[10].sendall(b"\xff" * 1_000_000)  # says what no client should
         server.send(data)
-        wait_for(lambda: server.n_clients == MAX_CLIENTS - 10)
+        wait_for(lambda: not server._outbox and server.n_clients == MAX_CLIENTS - 10)
         back = connect(server)  # one comes again
         wait_for(lambda: server.n_clients == MAX_CLIENTS - 9)
         server.send(data)
