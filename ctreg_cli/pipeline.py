@@ -290,7 +290,7 @@ def _with_pose(result: FrameResult, model: RodModel, pose_: TimedPose, scale: Sc
         T_slice_model=frozen(T, (4, 4)),
         covariance=frozen(covariance, (6, 6)),
         residual_px=frozen(seen.residual_px, (None, 2)),
-        lambda_mm=frozen(seen.lambda_mm, (None,)),
+        lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
         rms_px=seen.rms_px,
         chi2=seen.chi2,
     )

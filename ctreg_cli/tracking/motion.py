@@ -16,9 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray
-from ctreg_cli.geometry import pose as poses
-from ctreg_cli.geometry.plucker import skew
-from ctreg_cli.tracking.single import updated
+from ctreg_cli.tracking.single import inverse_positive, shifted, updated
 
 Prediction = Literal["velocity", "identity"]
 
@@ -70,7 +68,7 @@ def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: Fl
     full = np.zeros((12, 12))
     full[:6, :6] = covariance
     if kind == "velocity":
-        full[_VELOCITY, _VELOCITY] = np.square(_each_axis(FIRST_VELOCITY_SD))
+        full.ravel()[_VELOCITY] = np.square(_each_axis(FIRST_VELOCITY_SD))
     return MotionState(
         T=T,
         velocity=np.zeros(6),
@@ -84,16 +82,16 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
     P = np.array(state.covariance)
     spread = np.repeat(state.intensity, 3)
+    drifted = spread * dt_s
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
-        P[_POSE, _POSE] += spread * dt_s**3 / 3
-        P[_POSE, _VELOCITY] += spread * dt_s**2 / 2
-        P[_VELOCITY, _POSE] += spread * dt_s**2 / 2
-        P[_VELOCITY, _VELOCITY] += spread * dt_s
-    else:
-        P[_POSE, _POSE] += spread * dt_s
-    P[_POSE, _POSE] += _LEAST_STEP2 + _DOUBT2 * dt_s
+        diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
+        diagonals[_POSE_VELOCITY] += (0.5 * dt_s) * drifted
+        diagonals[_VELOCITY_POSE] += (0.5 * dt_s) * drifted
+        diagonals[_VELOCITY] += drifted
+        drifted *= dt_s**2 / 3
+    P.ravel()[_POSE] += drifted + (_LEAST_STEP2 + dt_s * _DOUBT2)
     return replace(state, T=updated(state.T, dt_s * state.velocity), covariance=P)
 
 
@@ -109,8 +107,7 @@ def correct(
         dt_s: time since the last measurement.
         kind: as for :func:`start`.
     """
-    S = predicted.pose_covariance + covariance
-    S_inverse = np.asarray(np.linalg.inv(S))
+    S_inverse = inverse_positive(predicted.pose_covariance + covariance)
     gain = predicted.covariance[:, :6] @ S_inverse
     step = gain @ innovation
     P = predicted.covariance - gain @ predicted.covariance[:6]
@@ -129,15 +126,21 @@ def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
 ) -> tuple[FloatArray, FloatArray]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
-    share = np.repeat(predicted.intensity, 3) * (dt_s**3 / 3 if kind == "velocity" else dt_s)
     z = S_inverse @ innovation
-    score = 0.5 * (share * (z * z - np.diagonal(S_inverse))).reshape(2, 3).sum(axis=1)
-    weighted = (S_inverse * share).reshape(2, 3, 2, 3)
-    information = np.array([0.5 * np.sum(weighted[i, :, i] * weighted[i, :, i].T) for i in range(2)])
-    information = MEMORY * predicted.information + information
-    log_step = np.minimum(np.maximum(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
-    intensity = predicted.intensity * np.exp(log_step)
-    return np.minimum(np.maximum(intensity, LEAST_INTENSITY), MOST_INTENSITY), information
+    surplus = z * z - S_inverse.diagonal()
+    intensities, informations = [], []
+    for i, (intensity, old) in enumerate(
+        zip(predicted.intensity.tolist(), predicted.information.tolist(), strict=True)
+    ):
+        part = slice(3 * i, 3 * i + 3)  # translation, then rotation
+        share = intensity * (dt_s**3 / 3 if kind == "velocity" else dt_s)
+        score = 0.5 * share * float(surplus[part].sum())
+        block = S_inverse[part, part].ravel()
+        information = MEMORY * old + 0.5 * share**2 * float(block @ block)
+        log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
+        intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]))
+        informations.append(information)
+    return np.array(intensities), np.array(informations)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -161,26 +164,22 @@ class StillAxes:
 
     def slice_pose(self, T: FloatArray) -> FloatArray:
         """``T_slice_model`` of a pose there."""
-        T = T.copy() if self.T_patient_slice is None else poses.inverse(self.T_patient_slice) @ T
-        T[:3, 3] -= T[:3, :3] @ self.middle
-        return T
+        placed = T.copy()
+        if self.T_patient_slice is not None:
+            placed[:3, 3] -= self.T_patient_slice[:3, 3]
+            placed[:3] = self.T_patient_slice[:3, :3].T @ placed[:3]
+        placed[:3, 3] -= placed[:3, :3] @ self.middle
+        return placed
 
     def twist(self, T_slice_model: FloatArray) -> FloatArray:
         """(6, 6) that takes a twist at the model origin in slice axes to the one there."""
-        G = _about(T_slice_model[:3, :3] @ self.middle)
+        G = shifted(T_slice_model[:3, :3] @ self.middle)
         return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]) @ G
 
     def slice_twist(self, T_slice_model: FloatArray) -> FloatArray:
         """The inverse of :meth:`twist`."""
-        G = _about(-T_slice_model[:3, :3] @ self.middle)
+        G = shifted(-T_slice_model[:3, :3] @ self.middle)
         return G if self.T_patient_slice is None else G @ _turned(self.T_patient_slice[:3, :3].T)
-
-
-def _about(lever_mm: FloatArray) -> FloatArray:
-    """(6, 6) that takes a twist to the one at a point ``lever_mm`` (3,) away: ``V + Ω × lever``."""
-    G = np.eye(6)
-    G[:3, 3:] = -skew(lever_mm)
-    return G
 
 
 def _turned(R: FloatArray) -> FloatArray:
@@ -193,5 +192,7 @@ def _each_axis(pair: tuple[float, float]) -> FloatArray:
     return np.repeat(np.array(pair, dtype=np.float64), 3)
 
 
-_POSE, _VELOCITY = np.arange(6), np.arange(6, 12)
+#: places in a (12, 12) covariance, row by row, of the diagonals of its four blocks
+_POSE, _VELOCITY = slice(0, 72, 13), slice(78, None, 13)
+_POSE_VELOCITY, _VELOCITY_POSE = slice(6, 72, 13), slice(72, 138, 13)
 _LEAST_STEP2, _DOUBT2 = np.square(_each_axis(LEAST_STEP_SD)), np.square(_each_axis(DOUBT_SD))

@@ -17,9 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
-from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import cross, updated
+from ctreg_cli.tracking.single import Crossing, cross, inverse_2x2, inverse_positive, lines_of, solve_positive, updated
 
 #: a step never turns the frame by more than this, rad
 _MAX_TURN_RAD = 0.5
@@ -31,7 +30,7 @@ class ServoOptions:
 
     #: share of the spot error taken back in one step, 0 < gain ≤ 1
     gain: float = 1.0
-    #: stop when a step moves the pose by less than this share of the frame's size (and as many rad) ...
+    #: stop when a full step would move the pose by less than this share of the frame's size (and as many rad) ...
     step_tolerance: float = 1e-9
     #: ... or the spots by less than this altogether, in standard deviations of theirs ...
     spot_tolerance_sd: float = 1e-3
@@ -44,31 +43,34 @@ class ServoOptions:
 class Desired:
     """The desired features s*: ``k`` measured spots and the rods they belong to."""
 
-    #: (k, 3) starts and unit directions of the rods, model frame, mm, and (k,) their tolerances
-    starts: FloatArray
-    directions: FloatArray
+    #: (4, 2k) the rods (:func:`~ctreg_cli.tracking.single.lines`), model frame, mm, and (k,) their tolerances
+    lines: FloatArray
     tolerances: FloatArray
     #: (k, 2) spots and (k, 2, 2) their covariances, px
     uv_px: FloatArray
     covariance_px: FloatArray
-    #: (2,) ``[s_x, s_y]``; ones where the spots are given in millimetres
-    mm_per_px: FloatArray
+    #: (2,) ``[s_x, s_y]``; None where the spots are given in millimetres (then read mm for px)
+    mm_per_px: FloatArray | None
     #: (k, 2, 2) inverse of ``covariance_px`` where that is all there is; None where tolerances add to it by the pose
     weight: FloatArray | None = None
 
     @classmethod
     def of(
-        cls, model: RodModel, rods: IntArray, uv_px: FloatArray, covariance_px: FloatArray, mm_per_px: FloatArray
+        cls,
+        model: RodModel,
+        rods: IntArray,
+        uv_px: FloatArray,
+        covariance_px: FloatArray,
+        mm_per_px: FloatArray | None = None,
     ) -> Desired:
         """The spots ``uv_px`` (k, 2) of the rods with the indices ``rods`` (k,)."""
         return cls(
-            starts=model.starts[rods],
-            directions=model.directions[rods],
+            lines=lines_of(model, rods),
             tolerances=model.tolerances[rods],
             uv_px=uv_px,
             covariance_px=covariance_px,
             mm_per_px=mm_per_px,
-            weight=None if model.tolerances.any() else invert_2x2(covariance_px),
+            weight=None if model.tolerances.any() else inverse_2x2(covariance_px),
         )
 
 
@@ -84,14 +86,14 @@ class View:
     weight: FloatArray
     #: (2k, 6) motion field, px per mm and rad
     jacobian: FloatArray
-    #: (k,) where the slice cuts each rod, mm
-    lambda_mm: FloatArray
+    #: the rods and the slice, mm
+    crossing: Crossing
 
     @property
     def chi2(self) -> float:
         """Σ rᵀ W r."""
-        r = self.residual_px
-        return float(((self.weight @ r[:, :, None])[:, :, 0] * r).sum())
+        r = self.residual_px[:, :, None]
+        return float((self.weight @ r).ravel() @ r.ravel())
 
     @property
     def rms_px(self) -> float:
@@ -107,26 +109,29 @@ class View:
 
 def view(desired: Desired, T: FloatArray) -> View:
     """The desired features from the pose ``T`` (4, 4); not finite where one of the rods lies in the slice."""
-    crossing = cross(T, desired.starts, desired.directions)
-    spots = crossing.xy_mm / desired.mm_per_px
+    crossing = cross(T, desired.lines)
+    spots, jacobian, s = crossing.xy_mm, crossing.jacobian, desired.mm_per_px
+    if s is not None:
+        spots = spots / s
+        jacobian = jacobian / s[:, None]
     covariance, weight = desired.covariance_px, desired.weight
     if weight is None:
         k = crossing.slope
         tolerance = k[:, :, None] * k[:, None, :]
         tolerance[:, 0, 0] += 1.0
         tolerance[:, 1, 1] += 1.0
-        tolerance *= (desired.tolerances**2)[:, None, None] / (desired.mm_per_px[:, None] * desired.mm_per_px)
+        tolerance *= (desired.tolerances**2)[:, None, None]
+        if s is not None:
+            tolerance /= s[:, None] * s
         covariance = covariance + tolerance
-        weight = invert_2x2(covariance)
-    jacobian = crossing.jacobian
-    jacobian /= desired.mm_per_px[:, None]
+        weight = inverse_2x2(covariance)
     return View(
         spots_px=spots,
         residual_px=desired.uv_px - spots,
         covariance_px=covariance,
         weight=weight,
         jacobian=jacobian.reshape(-1, 6),
-        lambda_mm=crossing.lambda_mm,
+        crossing=crossing,
     )
 
 
@@ -155,7 +160,7 @@ def pseudoinverse(jacobian: FloatArray, here: View) -> FloatArray:
         numpy.linalg.LinAlgError: the spots do not determine the pose.
     """
     WJ = here.weighted(jacobian)
-    return np.asarray(np.linalg.solve(WJ.T @ jacobian, WJ.T))
+    return solve_positive(WJ.T @ jacobian, WJ.T)
 
 
 def stability_margin(J_plus: FloatArray, jacobian: FloatArray, size_mm: float) -> float:
@@ -196,45 +201,84 @@ def servo(
     options = options or ServoOptions()
     unit = _unit(model.size_mm)
     here = view(desired, T)
-    J_plus = pseudoinverse(here.jacobian if jacobian is None else jacobian, here)
-    path = [(T, here.spots_px, stability_margin(J_plus, here.jacobian, model.size_mm))] if keep_path else []
-    converged, iterations = False, 0
-    while not converged and iterations < options.max_iterations:
-        step = options.gain * (J_plus @ here.residual_px.reshape(-1))  # the residual is s* − s
+    law = _Law.of(here, jacobian)
+    path = [(T, here, law.margin(here, model.size_mm))] if keep_path else []
+    iterations = 0
+    while True:
+        step, moved_sd2 = law.full_step(here)
+        converged = (
+            moved_sd2 <= options.spot_tolerance_sd**2
+            or max(map(abs, (step * unit).tolist())) <= options.step_tolerance * model.size_mm
+            or here.rms_px <= options.residual_tolerance
+        )
+        if converged or iterations >= options.max_iterations:
+            break
+        step *= options.gain
         turn = math.sqrt(float(step[3:] @ step[3:]))
         if turn > _MAX_TURN_RAD:
             step *= _MAX_TURN_RAD / turn
         iterations += 1
         T = updated(T, step)
-        last, here = here, view(desired, T)
+        here = view(desired, T)
         if not math.isfinite(float(here.residual_px.sum())):
             raise np.linalg.LinAlgError("a rod came to lie in the slice")
         if jacobian is None:
-            J_plus = pseudoinverse(here.jacobian, here)
+            law = _Law.of(here, None)
         if keep_path:
-            path.append((T, here.spots_px, stability_margin(J_plus, here.jacobian, model.size_mm)))
-        d = here.spots_px - last.spots_px
-        moved_sd2 = float(((here.weight @ d[:, :, None])[:, :, 0] * d).sum())
-        converged = (
-            moved_sd2 <= (options.spot_tolerance_sd * options.gain) ** 2
-            or float(np.abs(step * unit).max()) <= options.step_tolerance * options.gain * model.size_mm
-            or here.rms_px <= options.residual_tolerance
-        )
-    influence = J_plus
-    if jacobian is not None:  # noise moves the pose where Ĵᵀ W r = 0 by (Ĵ⁺ J)⁻¹ Ĵ⁺
-        influence = np.asarray(np.linalg.solve(J_plus @ here.jacobian, J_plus))
-    spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
+            path.append((T, here, law.margin(here, model.size_mm)))
     return ServoResult(
         T=T,
         view=here,
-        covariance=spread.reshape(6, -1) @ influence.T,
+        covariance=law.covariance(here),
         iterations=iterations,
         converged=converged,
-        margin=stability_margin(J_plus, here.jacobian, model.size_mm) if converged else -np.inf,
+        margin=law.margin(here, model.size_mm) if converged else -np.inf,
         path_T=np.stack([p for p, _, _ in path]) if keep_path else None,
-        path_px=np.stack([s for _, s, _ in path]) if keep_path else None,
+        path_px=np.stack([seen.spots_px for _, seen, _ in path]) if keep_path else None,
         path_margin=np.array([m for _, _, m in path]) if keep_path else None,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Law:
+    """``ξ = Ĵ⁺ (s* − s)`` with one Ĵ."""
+
+    #: (2k, 6) ``W Ĵ``, and (6, 6) ``Ĵᵀ W Ĵ``
+    weighted: FloatArray
+    information: FloatArray
+    #: (6, 2k) Ĵ⁺ of the constant strategy; None where Ĵ is the Jacobian at hand
+    J_plus: FloatArray | None
+
+    @classmethod
+    def of(cls, here: View, jacobian: FloatArray | None) -> _Law:
+        J = here.jacobian if jacobian is None else jacobian
+        WJ = here.weighted(J)
+        information = WJ.T @ J
+        return cls(
+            weighted=WJ,
+            information=information,
+            J_plus=None if jacobian is None else solve_positive(information, WJ.T),
+        )
+
+    def full_step(self, here: View) -> tuple[FloatArray, float]:
+        """The twist (6,) of gain one, and how far it would move the spots: Σ ‖Δs‖² in sd, to first order."""
+        gradient = here.residual_px.reshape(-1) @ self.weighted
+        step = solve_positive(self.information, gradient)
+        return step, float(gradient @ step)
+
+    def margin(self, here: View, size_mm: float) -> float:
+        """:func:`stability_margin`; one where Ĵ is the Jacobian itself."""
+        return 1.0 if self.J_plus is None else stability_margin(self.J_plus, here.jacobian, size_mm)
+
+    def covariance(self, here: View) -> FloatArray:
+        """(6, 6) of the pose where the law comes to rest."""
+        if self.J_plus is None:
+            return inverse_positive(self.information)
+        # noise moves the pose where Ĵᵀ W r = 0 by (Ĵ⁺ J)⁻¹ Ĵ⁺
+        influence = np.linalg.solve(self.J_plus @ here.jacobian, self.J_plus)
+        spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
+        covariance: FloatArray = spread.reshape(6, -1) @ influence.T
+        return covariance
 
 
 def _unit(size_mm: float) -> FloatArray:

@@ -33,7 +33,7 @@ from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.gate import GATE_SD, Outlook
 from ctreg_cli.tracking.prior import PastPrior
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
-from ctreg_cli.tracking.single import cross, difference
+from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
 from ctreg_cli.tracking.variants import covering, with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
@@ -84,6 +84,8 @@ class Prediction:
     #: (4, 4), and the (6, 6) covariance of the twist from it to the truth
     T: FloatArray
     covariance: FloatArray
+    #: all rods with this pose, mm
+    crossing: Crossing
     #: (n, 2) px, and whether each rod may be seen
     spots_px: FloatArray
     visible: BoolArray
@@ -154,19 +156,20 @@ class Tracker:
         T = axes.slice_pose(moved.T)
         G = axes.slice_twist(T)
         covariance = G @ moved.pose_covariance @ G.T
-        crossing = cross(T, model.starts, model.directions)
+        crossing = cross(T, model_lines(model))
         J = crossing.jacobian
-        reach = np.sqrt((J @ covariance * J).sum(axis=-1).max(axis=-1))
+        reach = np.sqrt((J @ covariance * J).sum(axis=2).max(axis=1))
         # how far along a rod that moves the slice
-        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * np.sqrt(1 + (crossing.slope**2).sum(axis=-1))
+        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height()
         visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
         s = scale.mm_per_px
         return Prediction(
             T=T,
             covariance=covariance,
+            crossing=crossing,
             spots_px=crossing.xy_mm / s,
             visible=visible,
-            radius_px=GATE_SD * reach / float(s.min()),
+            radius_px=reach * (GATE_SD / min(scale.s_x, scale.s_y)),
             motion=moved,
             dt_s=dt_s,
             n_slices=n_slices,
@@ -263,13 +266,13 @@ class Tracker:
         if len(scene.xy_mm) < CHECKABLE_MATCHES:
             return None, ""
         T = prediction.T
-        spot_of_rod = Outlook(model, scene, T).assigned(prediction.covariance)
+        spot_of_rod = Outlook(model, scene, T, prediction.crossing).assigned(prediction.covariance)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
                 return None, f"only {len(rods)} spots lie where the past expects them"
             spots = spot_of_rod[rods]
-            desired = Desired.of(model, rods, scene.xy_mm[spots], scene.covariance_mm[spots], np.ones(2))
+            desired = Desired.of(model, rods, scene.xy_mm.take(spots, axis=0), scene.covariance_mm.take(spots, axis=0))
             kept = self._kept_jacobian[rods].reshape(-1, 6) if constant and self._kept_jacobian is not None else None
             try:
                 moved = servo(model, T, desired, options=self._servo_options, jacobian=kept)
@@ -278,7 +281,8 @@ class Tracker:
             if not moved.converged:
                 return None, "the servo did not converge"
             T = moved.T
-            outlook = Outlook(model, scene, T)
+            # all rods seen: the servo's last look is at all of them
+            outlook = Outlook(model, scene, T, moved.view.crossing if len(rods) == len(model) else None)
             again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):
                 break
@@ -289,8 +293,8 @@ class Tracker:
         if constant:
             if moved.margin < LEAST_MARGIN:
                 return followed, f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
-            best = np.linalg.inv(moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian)
-            if np.trace(np.linalg.solve(best, moved.covariance)) > 6 * MOST_VARIANCE_RATIO:
+            information = moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian
+            if float((information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
                 return followed, "the constant Jacobian has become inefficient"
         return followed, ""
 
@@ -391,7 +395,7 @@ class Tracker:
             agrees = len(scene.xy_mm) < CHECKABLE_MATCHES
             agrees |= any(continues(candidate, prediction) for candidate in verdict.candidates)
             if not agrees:
-                gated = Outlook(self.model, scene, prediction.T).assigned(prediction.covariance)
+                gated = Outlook(self.model, scene, prediction.T, prediction.crossing).assigned(prediction.covariance)
                 agrees = int((gated >= 0).sum()) >= _MATCHES_THAT_AGREE
             self._is_lost = True
             self.miss()
@@ -423,7 +427,7 @@ class Tracker:
             innovation = difference(T, prediction.motion.T)
             state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind)
         if method == "registered":
-            self._kept_jacobian = np.nan_to_num(cross(best.T_slice_model, model.starts, model.directions).jacobian)
+            self._kept_jacobian = np.nan_to_num(cross(best.T_slice_model, model_lines(model)).jacobian)
         tracked = Tracked(
             registration=sure,
             method="reacquired" if self._is_lost else method,

@@ -10,26 +10,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtrc, chdtri, gammaln
+from scipy.special import chdtrc, chdtri
 
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
 from ctreg_cli.registration.integrity import protected_points
 from ctreg_cli.registration.matching import Scene
 from ctreg_cli.registration.options import RegistrationOptions
-from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MISS_P, fit_warnings, near_misses_p
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.gate import Outlook
 from ctreg_cli.tracking.servo import Desired, ServoResult, view
-from ctreg_cli.tracking.single import Crossing, difference
+from ctreg_cli.tracking.single import (
+    Crossing,
+    determinant_2x2,
+    difference,
+    inverse_2x2,
+    levers,
+    log_determinant,
+    solve_positive,
+    turned_by,
+)
 
 #: matches that leave a redundancy to check by: four spots leave two equations, too few to contradict a false one
 CHECKABLE_MATCHES = 5
@@ -49,6 +57,10 @@ _NEAR_D2, _LEAST_RISE = 9.0, 0.5
 _ODD_INNOVATION2 = 30.0
 #: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
 _TOUCHING_DIAMETERS, _TOUCHING_SIZE = 2.0, 0.05
+#: a spot fixes a direction alone when the others predict it with this share of certainty (of areas) or less
+_FIXES_ALONE = 1e-9
+#: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
+_NEIGHBOURHOOD, _LEAST_REACH = 1.25, 1e-3
 
 
 def verified(
@@ -78,33 +90,32 @@ def verified(
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
     chi2 = seen.chi2
-    p_chi2 = float(chdtrc(dof, chi2))
-    if len(rods) < CHECKABLE_MATCHES or p_chi2 < INFLATE_P or not scene.prior.allows(T[:3, :3]):
+    if len(rods) < CHECKABLE_MATCHES or float(chdtrc(dof, chi2)) < INFLATE_P or not _allowed(scene, T):
         return None
-    if _worst_turn(C) > VAGUE_POSE_RAD or _worst_turn(predicted_covariance) > VAGUE_PREDICTION_RAD:
+    if _is_vaguer(C, VAGUE_POSE_RAD) or _is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
         return None
-    projection = outlook.crossing
-    missing = np.nonzero(outlook.must_be_seen & (spot_of_rod < 0))[0]
+    crossings = outlook.crossing
+    missing = np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
     if (
-        not outlook.may_be_seen[rods].all()
+        not outlook.may_be_seen()[rods].all()
         or len(missing) > len(rods)
-        or _touching(model, projection.xy_mm, rods, missing)
+        or _touching(model, crossings.xy_mm, rods, missing)
     ):
         return None
-    if rod_end_shift_mm(model, rods, projection, scene.half_slab_mm) > 0:
+    if rod_end_shift_mm(model, rods, crossings, scene.half_slab_mm) > 0:
         return None
     without = LeftOut.of(moved)
     if without is None or _contested(scene, moved, without, spot_of_rod[rods]):
         return None
-    protection = without.protection_mm(protected_points(model), moved, options.integrity_risk)
+    protection = without.protection_mm(_protected(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
         return None
     innovation = difference(T, T_predicted)
     S = predicted_covariance + C
-    distance2 = float(innovation @ np.linalg.solve(S, innovation))
+    distance2 = float(innovation @ solve_positive(S, innovation))
     if distance2 > _ODD_INNOVATION2:
         return None
-    odds = _log_odds(model, scene, projection.xy_mm, moved, rods, missing, distance2, S)
+    odds = _log_odds(model, scene, crossings.xy_mm, moved, rods, missing, distance2, S)
     if not odds > ACCEPT_LOG_ODDS:
         return None
     residual = seen.residual_px / scale.mm_per_px
@@ -114,9 +125,9 @@ def verified(
         rod_index=frozen_index(rods),
         spot_index=frozen_index(spot_of_rod[rods]),
         residual_px=frozen(residual, (None, 2)),
-        lambda_mm=frozen(seen.lambda_mm, (None,)),
+        lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
         missing_rods=frozen_index(missing),
-        missing_px=frozen(projection.xy_mm[missing] / scale.mm_per_px, (None, 2)),
+        missing_px=frozen(crossings.xy_mm[missing] / scale.mm_per_px, (None, 2)),
         rms_px=float(np.sqrt(np.mean(residual**2))),
         chi2=chi2,
         degrees_of_freedom=dof,
@@ -139,9 +150,8 @@ def agrees_with_past(
     With few spots the cost is a long curved valley. Its lowest point may lie far from the truth, and the covariance
     there, a straight ellipsoid, does not reach back; the past does, along the valley.
     """
-    desired = Desired.of(
-        model, best.rod_index, scene.xy_mm[best.spot_index], scene.covariance_mm[best.spot_index], np.ones(2)
-    )
+    spots = best.spot_index
+    desired = Desired.of(model, best.rod_index, scene.xy_mm[spots], scene.covariance_mm[spots])
     information = np.linalg.inv(predicted_covariance)
     T = T_predicted
     for _ in range(_MAP_STEPS):
@@ -160,34 +170,60 @@ def agrees_with_past(
     return distance2 < _NEAR_D2 or rise > _LEAST_RISE * distance2
 
 
-def _worst_turn(covariance: FloatArray) -> float:
-    """Sd of the worst-known rotation, rad."""
-    return math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+def _allowed(scene: Scene, T: FloatArray) -> bool:
+    """:meth:`~ctreg_cli.registration.evidence.PosePrior.allows` of one pose."""
+    nominal = scene.prior.rotation
+    return nominal is None or turned_by(T, nominal) <= scene.prior.max_angle_rad
+
+
+def _is_vaguer(covariance: FloatArray, limit_rad: float) -> bool:
+    """Whether the sd of the worst-known rotation exceeds ``limit_rad``."""
+    turn = covariance[3:, 3:]
+    if sum(turn.diagonal().tolist()) <= limit_rad**2:  # the variances of all axes together
+        return False
+    return float(np.linalg.eigvalsh(turn)[-1]) > limit_rad**2
+
+
+@lru_cache(maxsize=16)
+def _reach_mm(model: RodModel) -> float:
+    """Crossings closer than this may leave one spot; cached, since a model is a value that never changes."""
+    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
+    return _TOUCHING_DIAMETERS * max(diameters) if diameters else _TOUCHING_SIZE * model.size_mm
+
+
+@lru_cache(maxsize=16)
+def _protected(model: RodModel) -> FloatArray:
+    """:func:`~ctreg_cli.registration.integrity.protected_points`, cached likewise."""
+    return protected_points(model)
 
 
 def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> bool:
     """Whether a rod that is seen, or should be, lies on a seen one's crossing: their spots may be one."""
-    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
-    reach = _TOUCHING_DIAMETERS * max(diameters) if diameters else _TOUCHING_SIZE * model.size_mm
-    there = np.concatenate([xy_mm[rods], xy_mm[missing]])
-    gap2 = ((there[:, None] - xy_mm[rods]) ** 2).sum(axis=-1)
-    return int((gap2 < reach**2).sum()) > len(rods)  # each lies on itself
+    x, y = xy_mm.T
+    there = np.concatenate([rods, missing]) if len(missing) else rods
+    d_x, d_y = x[there, None] - x[rods], y[there, None] - y[rods]
+    near = d_x * d_x + d_y * d_y < _reach_mm(model) ** 2
+    return int(np.count_nonzero(near)) > len(rods)  # each lies on itself
 
 
-def rod_end_shift_mm(model: RodModel, rods: IntArray, projection: Crossing, half_slab_mm: float) -> float:
+def rod_end_shift_mm(model: RodModel, rods: IntArray, crossing: Crossing, half_slab_mm: float) -> float:
     """How far in z a spot may lie off its crossing because a seen rod ends inside the slab, at most; mm."""
-    rise = 1 / np.sqrt(1 + (projection.slope[rods] ** 2).sum(axis=1))
-    to_end = np.minimum(projection.lambda_mm[rods], model.lengths[rods] - projection.lambda_mm[rods]) * rise
-    return max(0.0, half_slab_mm - float(to_end.min()))
+    if half_slab_mm == 0:
+        return 0.0
+    along = crossing.lambda_mm
+    to_end = np.minimum(along, model.lengths - along) / crossing.mm_per_height()
+    return max(0.0, half_slab_mm - float(to_end[rods].min()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeftOut:
     """What the other spots say of each of k spots (the hat matrix of regression: no fit is repeated)."""
 
-    #: (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``, and (k, 2, 1) residuals
+    #: (k, 6, 2) ``C Jᵀ`` and (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``
+    influence: FloatArray
     left: FloatArray
-    residual: FloatArray
+    #: (k, 2) ``(Σ − J C Jᵀ)⁻¹`` times the residual
+    pull: FloatArray
     #: (k,) squared distance of each spot from where the others predict it, in sd
     distance2: FloatArray
     #: (k, 2, 2) covariance of that prediction and the spot, and its determinant
@@ -198,39 +234,38 @@ class LeftOut:
     def of(cls, moved: ServoResult) -> LeftOut | None:
         """None where a spot alone fixes a direction of the pose: the others do not predict it."""
         own = moved.view.covariance_px
-        k = len(own)
-        J = moved.view.jacobian.reshape(k, 2, 6)
-        slack = own - J @ moved.covariance @ J.transpose(0, 2, 1)
-        if not (_det(slack) > 1e-9 * _det(own)).all() or not (slack[:, 0, 0] > 0).all():
+        J = moved.view.jacobian.reshape(-1, 2, 6)
+        influence = moved.covariance @ J.transpose(0, 2, 1)
+        slack = own - J @ influence
+        alone = determinant_2x2(slack) <= _FIXES_ALONE * determinant_2x2(own)
+        if alone.any() or float(slack[:, 0, 0].min()) <= 0:
             return None
-        left = invert_2x2(slack)
-        r = moved.view.residual_px[:, :, None]
+        left = inverse_2x2(slack)
+        r = moved.view.residual_px
+        pull = (left @ r[:, :, None])[:, :, 0]
         gate = own @ left @ own
         return cls(
-            left=left, residual=r, distance2=(r.transpose(0, 2, 1) @ left @ r)[:, 0, 0], gate=gate, gate_det=_det(gate)
+            influence=influence,
+            left=left,
+            pull=pull,
+            distance2=(pull * r).sum(axis=1),
+            gate=gate,
+            gate_det=determinant_2x2(gate),
         )
 
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
         """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
-        k = len(self.left)
-        C = moved.covariance
-        CJ = C @ moved.view.jacobian.reshape(k, 2, 6).transpose(0, 2, 1)  # (k, 6, 2)
-        apart = (CJ @ self.left @ self.residual)[:, :, 0]
-        C_without = C + CJ @ self.left @ CJ.transpose(0, 2, 1)
-        G = np.zeros((len(points), 3, 6))
-        G[:, :, :3] = np.eye(3)
-        G[:, :, 3:] = -skew(points @ moved.T[:3, :3].T)
-        separation = np.linalg.norm(G @ apart[:, None, :, None], axis=(2, 3))  # (k, p)
-        every = np.concatenate([C_without, C[None]])
-        variance = np.linalg.eigvalsh(G @ every[:, None] @ G.transpose(0, 2, 1))[..., -1]
-        level = math.sqrt(float(chdtri(3, risk / (k + 1)))) * np.sqrt(variance)
-        level[:-1] += separation
-        return np.asarray(level.max(axis=0))
-
-
-def _det(matrices: FloatArray) -> FloatArray:
-    determinant: FloatArray = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
-    return determinant
+        k, p = len(self.left), len(points)
+        G = levers(points @ moved.T[:3, :3].T)
+        moves = G[:, None] @ self.influence  # (p, k, 3, 2)
+        variance = np.empty((p, k + 1, 3, 3))
+        variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
+        variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
+        level = np.sqrt(np.linalg.eigvalsh(variance)[..., -1])
+        level *= math.sqrt(float(chdtri(3, risk / (k + 1))))
+        separation = moves @ self.pull[:, :, None]
+        level[:, :k] += np.sqrt((separation * separation).sum(axis=(2, 3)))
+        return np.asarray(level.max(axis=1))
 
 
 def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray) -> bool:
@@ -244,10 +279,11 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
         density = free / float(extent[0] * extent[1])
         if math.pi * ODD_D2 * math.sqrt(float(without.gate_det.max())) * density > CHANCE_IN_GATE:
             return True
-    predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.left @ without.residual)[:, :, 0]
-    d = scene.xy_mm - predicted[:, None]  # (k, m, 2)
-    distance2 = ((d @ invert_2x2(without.gate)) * d).sum(axis=-1)
-    return int((distance2 < CONTEST_D2).sum()) > k
+    predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.pull[:, :, None])[:, :, 0]
+    d_x, d_y = scene.xy_mm.T[:, None] - predicted.T[:, :, None]  # each (k, m)
+    a, b, c = (without.gate[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    near = (c * d_x - (b + b) * d_y) * d_x + a * d_y * d_y < CONTEST_D2 * without.gate_det[:, None]
+    return int(np.count_nonzero(near)) > k
 
 
 def _log_odds(
@@ -261,24 +297,22 @@ def _log_odds(
     S: FloatArray,
 ) -> float:
     """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone."""
-    seen = np.concatenate([xy_mm[rods], xy_mm[missing]])
-    centre = seen.mean(axis=0)
-    reach = max(1.25 * math.sqrt(float(((seen - centre) ** 2).sum(axis=1).max())), 1e-3 * model.size_mm)
-    near = int((((scene.xy_mm - centre) ** 2).sum(axis=1) <= reach**2).sum())
+    there = xy_mm.take(np.concatenate([rods, missing]) if len(missing) else rods, axis=0)
+    centre = there.sum(axis=0) / len(there)
+    away = there - centre
+    reach2 = max(_NEIGHBOURHOOD**2 * float((away * away).sum(axis=1).max()), (_LEAST_REACH * model.size_mm) ** 2)
+    away = scene.xy_mm - centre
     n = len(rods)
-    m = max(near, n)
-    _, logdet_C = np.linalg.slogdet(moved.covariance)
-    _, logdet_S = np.linalg.slogdet(S)
-    volume = min(-0.5 * distance2 + 0.5 * (float(logdet_C) - float(logdet_S)), 0.0)
-    W = moved.view.weight
-    det_w = W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0]
-    per_spot = n * (math.log(P_SEEN) - math.log(2 * math.pi)) + 0.5 * float(np.log(det_w).sum())
-    ways = float(gammaln(m - n + 0.5) - gammaln(m + 0.5))
+    m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
+    volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_determinant(S)), 0.0)
+    log_weights = float(np.log(determinant_2x2(moved.view.weight)).sum())
     return (
         volume
-        + per_spot
+        + n * (math.log(P_SEEN) - math.log(2 * math.pi))
+        + 0.5 * log_weights
         - 0.5 * moved.view.chi2
-        + n * math.log(math.pi * reach**2)
-        + ways
+        + n * math.log(math.pi * reach2)
+        + math.lgamma(m - n + 0.5)
+        - math.lgamma(m + 0.5)
         + len(missing) * math.log(1 - P_SEEN)
     )

@@ -19,7 +19,7 @@ def test_crossings_and_motion_field(seed: int) -> None:
     rng = np.random.default_rng(seed)
     model = model_of(random_frame(rng, 8))
     T = poses.update(np.eye(4), np.concatenate([rng.normal(size=3) * 100, rng.normal(size=3)]))
-    crossing, projection = single.cross(T, model.starts, model.directions), project(T, model.starts, model.directions)
+    crossing, projection = single.cross(T, single.model_lines(model)), project(T, model.starts, model.directions)
     np.testing.assert_allclose(crossing.xy_mm, projection.xy_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.lambda_mm, projection.lambda_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.slope, projection.slope, rtol=1e-12)
@@ -27,7 +27,7 @@ def test_crossings_and_motion_field(seed: int) -> None:
 
 
 def test_a_rod_in_the_slice_is_nan_and_no_warning() -> None:
-    crossing = single.cross(np.eye(4), np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    crossing = single.cross(np.eye(4), single.lines(np.zeros((2, 3)), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])))
     assert np.isnan(crossing.xy_mm[0]).all()
     assert np.isfinite(crossing.xy_mm[1]).all()
 
