@@ -310,16 +310,14 @@ def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
     """Which predicted spots lie in the image."""
     if shape is None:
         shape = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
-    with np.errstate(invalid="ignore"):
-        low, high = uv_px >= 0, uv_px <= np.array([shape[1] - 1, shape[0] - 1])
-    inside: BoolArray = low[:, 0] & low[:, 1] & high[:, 0] & high[:, 1]
+    u, v = uv_px.T
+    inside: BoolArray = (u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)
     return inside
 
 
 def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Tracked) -> FrameResult:
     index = place if item.index is None else item.index
-    result = frame_result(index, item, tracker.model, tracked.registration, method=tracked.method)
-    return replace(result, stability=tracked.stability, velocity=tracked.velocity, begins=tracked.begins)
+    return frame_result(index, item, tracker.model, tracked.registration, method=tracked.method, tracked=tracked)
 
 
 def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
@@ -349,8 +347,9 @@ def frame_result(
     registration: Registration,
     *,
     method: str,
+    tracked: Tracked | None = None,
 ) -> FrameResult:
-    """A verdict, with the targets' places and accuracy, as a row."""
+    """A verdict, with the targets' places and accuracy, as a row; ``tracked`` where it is one of a sequence."""
     best = registration.best
     return FrameResult(
         index=index,
@@ -362,6 +361,9 @@ def frame_result(
         candidates=registration.candidates,
         targets=() if best is None else target_accuracy(model, best, item.info.T_patient_slice),
         warnings=registration.warnings,
+        stability=tracked.stability if tracked else None,
+        velocity=tracked.velocity if tracked else None,
+        begins=tracked is not None and tracked.begins,
     )
 
 

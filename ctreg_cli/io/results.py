@@ -14,13 +14,14 @@ import numpy as np
 from ctreg_cli._version import __version__
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import InputError
-from ctreg_cli.geometry.pose import from_quaternion, quaternion
-from ctreg_cli.io.sinks import Encoding, open_sinks, rounded
+from ctreg_cli.geometry.pose import from_quaternion
+from ctreg_cli.io.sinks import Encoding, cell, open_sinks, rounded
 from ctreg_cli.io.tum import HEADER, tum_lines
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.single import quaternion
 from ctreg_cli.tracking.tracker import Velocity
 
 SCHEMA = "ctreg/poses/1"
@@ -84,10 +85,10 @@ def results_encoding(header: ResultsHeader, *, with_uids: bool = False) -> Encod
 
     def row(result: FrameResult) -> list[Sequence[object]]:
         fields = _fields(result, header)
-        return [[fields.get(name) for name in COLUMNS]]
+        return [[_cell(fields.get(name), digits) for name, digits in COLUMNS.items()]]
 
     def record(result: FrameResult) -> dict[str, object]:
-        fields = _fields(result, header)
+        fields = {name: _rounded(value, COLUMNS[name]) for name, value in _fields(result, header).items()}
         uids: dict[str, object] = {"uids": dict(result.info.uids)} if with_uids else {}
         warnings = [{"code": code, "text": text} for code, text in result.warnings]
         return {name: fields.get(name) for name in COLUMNS} | uids | _evidence(result, header) | {"warnings": warnings}
@@ -161,7 +162,7 @@ def _fields(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
         fields["n_false"] = len(result.spots) - len(candidate.spot_index)
     if result.velocity is not None:
         fields |= _velocity_fields(result.velocity)
-    return {name: _rounded(value, COLUMNS[name]) for name, value in fields.items()}
+    return fields
 
 
 def _rounded(value: object, digits: int | None) -> object:
@@ -170,17 +171,27 @@ def _rounded(value: object, digits: int | None) -> object:
     return rounded(value, digits)
 
 
+def _cell(value: object, digits: int | None) -> str:
+    """Text of :func:`_rounded`, formatted once where that gives the same."""
+    if digits is not None and isinstance(value, float) and math.isfinite(value):
+        text = f"{value:.{digits}g}"
+        if "e+" not in text:  # %g writes large numbers as powers of ten
+            return text
+    return cell(_rounded(value, digits))
+
+
 def _pose_fields(candidate: Candidate) -> dict[str, object]:
     T = candidate.T_slice_model
-    sd = np.sqrt(np.diagonal(candidate.covariance)).tolist()
-    translation, rotation = T[:3, 3].tolist(), quaternion(T).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion(T)
+    sd_tx, sd_ty, sd_tz, sd_rx, sd_ry, sd_rz = map(math.sqrt, candidate.covariance.diagonal().tolist())
     return {
         "n_matched": len(candidate.rod_index),
         "rms_px": float(candidate.rms_px),
-        **dict(zip(("tx_mm", "ty_mm", "tz_mm"), translation, strict=True)),
-        **dict(zip(("qx", "qy", "qz", "qw"), rotation, strict=True)),
-        **dict(zip(("sd_tx_mm", "sd_ty_mm", "sd_tz_mm"), sd[:3], strict=True)),
-        **dict(zip(("sd_rx_deg", "sd_ry_deg", "sd_rz_deg"), map(math.degrees, sd[3:]), strict=True)),
+        **{"tx_mm": tx, "ty_mm": ty, "tz_mm": tz},
+        **{"qx": qx, "qy": qy, "qz": qz, "qw": qw},
+        **{"sd_tx_mm": sd_tx, "sd_ty_mm": sd_ty, "sd_tz_mm": sd_tz},
+        **{"sd_rx_deg": math.degrees(sd_rx), "sd_ry_deg": math.degrees(sd_ry), "sd_rz_deg": math.degrees(sd_rz)},
         "iterations": int(candidate.iterations),
         "log_odds": float(candidate.log_odds),
         "inflation": float(candidate.inflation),
@@ -188,13 +199,14 @@ def _pose_fields(candidate: Candidate) -> dict[str, object]:
 
 
 def _velocity_fields(velocity: Velocity) -> dict[str, object]:
-    twist, sd = velocity.twist.tolist(), np.sqrt(np.diagonal(velocity.covariance)).tolist()
-    names = ("vx_mm_s", "vy_mm_s", "vz_mm_s", "wx_deg_s", "wy_deg_s", "wz_deg_s")
-    to_units = (*3 * (float,), *3 * (math.degrees,))
-    fields: dict[str, object] = {}
-    for name, to_unit, value, value_sd in zip(names, to_units, twist, sd, strict=True):
-        fields |= {name: to_unit(value), f"sd_{name}": to_unit(value_sd)}
-    return fields
+    vx, vy, vz, wx, wy, wz = velocity.twist.tolist()
+    sd_vx, sd_vy, sd_vz, sd_wx, sd_wy, sd_wz = map(math.sqrt, velocity.covariance.diagonal().tolist())
+    return {
+        **{"vx_mm_s": vx, "vy_mm_s": vy, "vz_mm_s": vz},
+        **{"wx_deg_s": math.degrees(wx), "wy_deg_s": math.degrees(wy), "wz_deg_s": math.degrees(wz)},
+        **{"sd_vx_mm_s": sd_vx, "sd_vy_mm_s": sd_vy, "sd_vz_mm_s": sd_vz},
+        **{"sd_wx_deg_s": math.degrees(sd_wx), "sd_wy_deg_s": math.degrees(sd_wy), "sd_wz_deg_s": math.degrees(sd_wz)},
+    }
 
 
 def _evidence(result: FrameResult, header: ResultsHeader) -> dict[str, object]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtrc
@@ -65,11 +66,17 @@ _FEW = 6
 def pose_prior(model: RodModel, T_patient_slice: FloatArray | None, options: RegistrationOptions) -> PosePrior:
     """The mount of the frame file as a cone of rotations model → slice."""
     if model.mount is None or not options.use_mount:
-        return PosePrior.of_rods(model.directions)
+        return _prior_of_rods(model)
     R = np.asarray(model.mount.patient_from_model, dtype=np.float64)
     if T_patient_slice is not None:
         R = T_patient_slice[:3, :3].T @ R
     return PosePrior(rotation=R, max_angle_rad=math.radians(model.mount.max_angle_deg))
+
+
+@lru_cache(maxsize=16)
+def _prior_of_rods(model: RodModel) -> PosePrior:
+    """Cached, since a model is a value that never changes."""
+    return PosePrior.of_rods(model.directions)
 
 
 def make_scene(

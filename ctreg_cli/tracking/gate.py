@@ -31,8 +31,6 @@ class Outlook:
         """``crossing``: of all rods with ``T``, where it has been worked out already."""
         self.model, self.scene, self.T = model, scene, T
         self.crossing = crossing or cross(T, model_lines(model))
-        #: (n, 2, 2) mm²: covariance of each crossing by that of the pose, once :meth:`assigned` has made it
-        self.spread: FloatArray | None = None
         self._slack_mm = self._end_slack_mm()
         self._in_field = self._inside_image()
 
@@ -72,7 +70,6 @@ class Outlook:
         xy, J = self.scene.xy_mm, self.crossing.jacobian
         S = self.scene.covariance_mm
         G = J @ covariance @ J.transpose(0, 2, 1)
-        self.spread = G
         if greatest_tolerance_mm(self.model) > 0:
             k = self.crossing.slope
             G = G + (self.model.tolerances**2)[:, None, None] * (np.eye(2) + k[:, :, None] * k[:, None, :])

@@ -132,6 +132,22 @@ def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:
     return twist
 
 
+def quaternion(T: FloatArray) -> tuple[float, float, float, float]:
+    """:func:`ctreg_cli.geometry.pose.quaternion` of one pose: ``qx qy qz qw``, ``qw ≥ 0`` (Shepperd 1978)."""
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = T[:3, :3].tolist()
+    # four times the squares of the components; the largest is safe to divide by
+    squares = (1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22, 1 + r00 + r11 + r22)
+    largest = squares.index(max(squares))
+    x, y, z, w = (
+        (squares[0], r10 + r01, r20 + r02, r21 - r12),
+        (r10 + r01, squares[1], r21 + r12, r02 - r20),
+        (r20 + r02, r21 + r12, squares[2], r10 - r01),
+        (r21 - r12, r02 - r20, r10 - r01, squares[3]),
+    )[largest]
+    scale = math.copysign(1 / math.sqrt(x * x + y * y + z * z + w * w), w)
+    return x * scale, y * scale, z * scale, w * scale
+
+
 def turned_by(T: FloatArray, nominal: FloatArray) -> float:
     """Angle, rad, between the rotations of a pose (4, 4) and a nominal one (3, 3)."""
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = (T[:3, :3] @ nominal.T).tolist()

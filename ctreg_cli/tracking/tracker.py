@@ -283,6 +283,8 @@ class Tracker:
             T = moved.T
             # all rods seen: the servo's last look is at all of them
             outlook = Outlook(model, scene, T, moved.view.crossing if len(rods) == len(model) else None)
+            if len(rods) == len(model) == len(scene.xy_mm) and moved.view.chi2 < GATE_SD**2:
+                break  # no rod or spot is left over, and none can be outside its gate
             again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):
                 break

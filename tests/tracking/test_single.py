@@ -43,3 +43,41 @@ def test_updates_and_differences(angle: float) -> None:
         moved = single.updated(T, twist)
         np.testing.assert_allclose(moved, poses.update(T, twist), atol=1e-14)
         np.testing.assert_allclose(single.difference(moved, T), twist, atol=1e-9 if angle > 3 else 1e-13)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_quaternions(seed: int) -> None:
+    """Every branch: turns about each axis up to the half circle, where the scalar vanishes."""
+    rng = np.random.default_rng(seed)
+    axes = [*np.eye(3), *rng.normal(size=(5, 3))]
+    for axis in axes:
+        for angle in (0.0, 1e-9, 0.5, 2.0, 3.0, np.pi - 1e-6):
+            T = np.eye(4)
+            T[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+            np.testing.assert_allclose(single.quaternion(T), poses.quaternion(T), atol=1e-9)
+            assert single.quaternion(T)[3] >= 0
+
+
+def test_small_positive_definite_systems() -> None:
+    rng = np.random.default_rng(1)
+    half = rng.normal(size=(9, 6))
+    A, b = half.T @ half, rng.normal(size=6)
+    np.testing.assert_allclose(A @ single.solve_positive(A, b), b, atol=1e-9)
+    np.testing.assert_allclose(single.inverse_positive(A), np.linalg.inv(A), rtol=1e-9, atol=1e-12)
+    assert single.log_determinant(A) == pytest.approx(np.linalg.slogdet(A)[1])
+    for singular in (np.zeros((6, 6)), -A):
+        for function in (single.inverse_positive, single.log_determinant):
+            with pytest.raises(np.linalg.LinAlgError):
+                function(singular)
+    blocks = rng.normal(size=(5, 2, 2))
+    np.testing.assert_allclose(single.inverse_2x2(blocks) @ blocks, np.tile(np.eye(2), (5, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(single.determinant_2x2(blocks), np.linalg.det(blocks))
+
+
+def test_how_a_twist_moves_points() -> None:
+    rng = np.random.default_rng(2)
+    points, twist = rng.normal(size=(4, 3)), rng.normal(size=6)
+    expected = twist[:3] + np.cross(twist[3:], points)
+    np.testing.assert_allclose(single.levers(points) @ twist, expected)
+    for point, velocity in zip(points, expected, strict=True):
+        np.testing.assert_allclose(single.shifted(point) @ twist, [*velocity, *twist[3:]])
