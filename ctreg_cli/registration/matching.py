@@ -45,16 +45,30 @@ from ctreg_cli.rods import RodModel
 _GATE2 = 20.0
 #: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
 _WIDEST_GATE = 0.2
+#: matches up to which nothing checks the fit but the odds
+LEAST_CHECKED = 4
+#: how many triples of any five rods or more are tried
+_COVER = 2
+#: ln odds beyond which a match is no chance (10⁹ : 1, Lang et al. 2010): only its own spots can tell another story
+_BEYOND_CHANCE = math.log(1e9)
 #: hypotheses a stage hands on to refinement
-_KEEP_PER_TRIPLE = 24
+_KEEP_PER_STAGE = 40
 #: votes are a rough measure of the odds: hypotheses this many nats under the best of a rod triple are not refined
 _VOTES_WITHIN = 25.0
 #: rivals within this many nats of the best are kept for the verdict (a good deal more than the verdict's own 100 : 1)
 _KEEP_WITHIN = 12.0
+#: fewer matches are looked for while they could come this near the best: what the verdict asks of a rival, and a nat
+_RIVALS_WITHIN = 7.5
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
-#: spot triples examined at once, to bound memory
-_CHUNK = 40_000
+#: rod triples of a match whose roots it is refined from anew, to find its second minima
+_RESTARTS = 20
+#: spot triples examined at once: as many as stay in the processor's cache
+_CHUNK = 12_000
+#: so many spot triples of one rod triple are worth a call of their own
+_ALONE = 3_000
+#: above this many spots a tree finds the nearest
+_MANY_SPOTS = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +164,9 @@ def plan(model: RodModel) -> SearchPlan:
     least, greatest = segment_distance_range(model.starts, model.ends)
     triples = np.array(list(itertools.combinations(range(len(model)), 3)), dtype=np.intp)
     strength = _triple_strength(model, triples)
-    order, prefix = _covering_order(len(model), triples, strength)
+    area = (greatest**2 - least**2)[triples[:, [0, 0, 1]], triples[:, [1, 2, 2]]].prod(axis=1)
+    cheapness = np.sqrt(area.min() / area) if area.min() > 0 else np.ones(len(area))
+    order, prefix = _covering_order(len(model), triples, strength * cheapness)
     return SearchPlan(
         least_mm=least, greatest_mm=greatest, triples=triples[order], prefix=prefix, strength=strength[order]
     )
@@ -186,15 +202,19 @@ def _basis_along(axis: FloatArray) -> FloatArray:
     return np.stack([first, np.cross(axis, first), axis])
 
 
-def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[IntArray, dict[int, int]]:
-    """Triples ordered so that, for each k from n down to 3, a prefix holds a triple of *any* k rods (greedy cover)."""
+def _covering_order(n: int, triples: IntArray, worth: FloatArray) -> tuple[IntArray, dict[int, int]]:
+    """Triples ordered so that, for each k from n down to 3, a prefix holds triples of *any* k rods (greedy cover).
+
+    Of five rods or more it holds :data:`_COVER` triples: noise can take every root from a weak one.
+    """
     chosen: list[int] = []
     prefix: dict[int, int] = {}
     free = np.ones(len(triples), dtype=bool)
     for k in range(n, 2, -1):
-        if math.comb(n, k) > 20_000:  # many rods: spread the triples by strength alone
-            prefix[k] = min(len(triples), 4 * (n - k + 1))
-            for t in np.argsort(-strength, kind="stable"):
+        times = _COVER if k > LEAST_CHECKED else 1
+        if math.comb(n, k) > 20_000:  # many rods: spread the triples by worth alone
+            prefix[k] = min(len(triples), 2 * times * (n - k + 1))
+            for t in np.argsort(-worth, kind="stable"):
                 if len(chosen) >= prefix[k]:
                     break
                 if free[t]:
@@ -205,13 +225,13 @@ def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[In
         for row, members in enumerate(itertools.combinations(range(n), k)):
             sets[row, list(members)] = True
         holds: BoolArray = np.logical_and.reduce(sets[:, triples], axis=2)  # (sets, triples)
-        open_sets: BoolArray = ~np.logical_or.reduce(holds[:, np.array(chosen, dtype=np.intp)], axis=1)
-        while open_sets.any():
-            gain = holds[open_sets].sum(axis=0) * (1e-3 + strength / strength.max()) * free
+        lacking = times - holds[:, np.array(chosen, dtype=np.intp)].sum(axis=1)
+        while (lacking > 0).any():
+            gain = holds[lacking > 0].sum(axis=0) * (1e-3 + worth / worth.max()) * free
             best = int(gain.argmax())
             free[best] = False
             chosen.append(best)
-            open_sets &= ~holds[:, best]
+            lacking -= holds[:, best]
         prefix[k] = len(chosen)
     return np.array(chosen, dtype=np.intp), prefix
 
@@ -220,7 +240,11 @@ def _covering_order(n: int, triples: IntArray, strength: FloatArray) -> tuple[In
 
 
 def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches | None:
-    """All matches worth a verdict, best first; None when no pose gathers ``least_matches`` spots."""
+    """All matches worth a verdict, best first; None when no pose gathers ``least_matches`` spots.
+
+    Once a match beats chance by :data:`_BEYOND_CHANCE`, no rival is left to chance either: it would have to share spots
+    with it, so that only triples of its own spots are tried further, and the spots left over for a second frame.
+    """
     m = len(scene.xy_mm)
     if m < least_matches:
         return None
@@ -228,20 +252,42 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
     found: list[Matches] = []
     seen: set[bytes] = set()
     best: Matches | None = None
+    start_from = np.arange(m)
     done = 0
     for k in range(min(len(model), m), least_matches - 1, -1):
         if best is not None and not _could_rival(scene, best, k):
             break
         while done < layout.prefix[k]:
-            part = _search_triple(model, scene, layout.triples[done], least_matches, seen)
-            done += 1
-            if part is not None:
-                found.append(part)
-                if best is None or part.log_odds[0] > best.log_odds[0]:
-                    best = part.subset(np.array([0]))
+            # few hypotheses cost less together, many are worth stopping after each triple
+            end = done + 1 if len(start_from) > _MANY_SPOTS else layout.prefix[k]
+            part = _search_triples(model, scene, layout.triples[done:end], start_from, least_matches, seen)
+            done = end
+            if part is None:
+                continue
+            found.append(part)
+            if best is None or part.log_odds[0] > best.log_odds[0]:
+                best = part.subset(np.array([0]))
+                if best.log_odds[0] > _BEYOND_CHANCE:
+                    start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
+    if best is not None and best.log_odds[0] > _BEYOND_CHANCE:
+        second = _second_frame(model, scene, best, least_matches)
+        if second is not None:
+            found.append(second)
     if not found:
         return None
     return distinct(model, join(found))
+
+
+def _second_frame(model: RodModel, scene: Scene, best: Matches, least_matches: int) -> Matches | None:
+    """A match as good as ``best`` among the spots it leaves over; not looked for in a field of clutter."""
+    free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_of_rod[0])
+    if len(free) > _MANY_SPOTS:
+        return None
+    enough = [k for k in range(least_matches, min(len(model), len(free)) + 1) if _could_rival(scene, best, k)]
+    if not enough:
+        return None
+    layout = plan(model)
+    return _search_triples(model, scene, layout.triples[: layout.prefix[enough[0]]], free, enough[0], set())
 
 
 def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
@@ -259,19 +305,23 @@ def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
     spread = np.ptp(scene.xy_mm[best.spot_of_rod[0, matched]], axis=0)
     worth = math.log(P_SEEN / (1 - P_SEEN)) - math.log(2 * math.pi) + 0.5 * np.log(precision)
     worth += math.log(max(float(spread[0] * spread[1]), 1e-9)) - math.log(max(m - k, 1))
-    return float(worth.sum() - 0.5 * best.fit.chi2[0]) < _KEEP_WITHIN
+    return float(worth.sum() - 0.5 * best.fit.chi2[0]) < _RIVALS_WITHIN
 
 
-def _search_triple(
-    model: RodModel, scene: Scene, rods: IntArray, least_matches: int, seen: set[bytes]
+def _search_triples(
+    model: RodModel, scene: Scene, rods: IntArray, start_from: IntArray, least_matches: int, seen: set[bytes]
 ) -> Matches | None:
-    """Poses from one rod triple against all spot triples, voted and weighed; ``seen``: match sets already weighed."""
+    """Poses from rod triples (g, 3) against all triples of the spots ``start_from``, voted by all spots and weighed.
+
+    ``seen`` collects the match sets already weighed.
+    """
     layout = plan(model)
     noise = _noise_mm(model, scene)
     kept: list[tuple[FloatArray, FloatArray, IntArray]] = []
-    for spots in _spot_triples(scene.xy_mm, layout, rods, 4 * noise):
+    for triple, spots in _spot_triples(scene.xy_mm[start_from], layout, rods, 4 * noise):
+        spots = start_from[spots]
         T, which = scan_three(
-            RodTriples.of(model, rods),
+            RodTriples.of(model, rods[triple]),
             scene.xy_mm[spots],
             slack_mm=3 * noise + 2 * scene.half_slab_mm,
             noise_mm=noise,
@@ -279,13 +329,14 @@ def _search_triple(
         allowed = scene.prior.allows(T[:, :3, :3])
         T, which = T[allowed], which[allowed]
         if len(T):
-            kept.append(_vote(model, scene, T, rods, spots[which], least_matches))
+            of_pose = triple[which] if len(triple) > 1 else np.repeat(triple, len(which))
+            kept.append(_vote(model, scene, T, rods[of_pose], spots[which], least_matches))
     if not kept:
         return None
     score, T, spot_of_rod = (np.concatenate(column) for column in zip(*kept, strict=True))
     top: list[int] = []
     for i in np.argsort(-score, kind="stable"):
-        if len(top) >= _KEEP_PER_TRIPLE or score[i] < score[top[0] if top else i] - _VOTES_WITHIN:
+        if len(top) >= _KEEP_PER_STAGE or score[i] < score[top[0] if top else i] - _VOTES_WITHIN:
             break
         key = spot_of_rod[i].tobytes()
         if key not in seen:
@@ -298,73 +349,107 @@ def _search_triple(
 
 def _noise_mm(model: RodModel, scene: Scene) -> float:
     """A generous standard deviation of a spot about its rod, mm."""
-    spot = np.sqrt(np.quantile(np.trace(scene.covariance_mm, axis1=1, axis2=2) / 2, 0.8))
-    return float(math.hypot(float(spot), 1.3 * float(model.tolerances.max())))
+    variance = np.sort(scene.covariance_mm[:, 0, 0] + scene.covariance_mm[:, 1, 1]) / 2
+    spot = math.sqrt(variance[int(0.8 * (len(variance) - 1))])
+    return float(math.hypot(spot, 1.3 * float(model.tolerances.max())))
 
 
-def _spot_triples(xy_mm: FloatArray, layout: SearchPlan, rods: IntArray, slack_mm: float) -> Iterator[IntArray]:
-    """Ordered spot triples (·, 3) whose distances these three rods can show, in chunks."""
+def _spot_triples(
+    xy_mm: FloatArray, layout: SearchPlan, rods: IntArray, slack_mm: float
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Ordered spot triples (·, 3) whose distances the rod triples (g, 3) can show, in chunks.
+
+    With each chunk comes the row of ``rods`` each belongs to: (·,), or (1,) where all belong to one.
+    """
     gap = np.linalg.norm(xy_mm[:, None] - xy_mm[None], axis=-1)
-
-    def possible(i: int, j: int) -> BoolArray:
-        a, b = rods[i], rods[j]
-        result: BoolArray = (gap >= layout.least_mm[a, b] - slack_mm) & (gap <= layout.greatest_mm[a, b] + slack_mm)
-        np.fill_diagonal(result, False)
-        return result
-
-    ok12, ok13, ok23 = possible(0, 1), possible(0, 2), possible(1, 2)
-    rows = max(1, _CHUNK // max(1, len(xy_mm)) // max(1, int(ok23.sum(axis=1).max(initial=1))))
-    for first in range(0, len(xy_mm), rows):
-        part = slice(first, first + rows)
-        a, b, c = np.nonzero(ok12[part, :, None] & ok13[part, None, :] & ok23[None])
-        if len(a):
-            yield np.stack([a + first, b, c], axis=1)
+    np.fill_diagonal(gap, np.nan)
+    waiting: list[tuple[IntArray, IntArray]] = []
+    for row, triple in enumerate(rods):
+        first, second = triple[[0, 0, 1]], triple[[1, 2, 2]]
+        ok12, ok13, ok23 = (gap >= layout.least_mm[first, second, None, None] - slack_mm) & (
+            gap <= layout.greatest_mm[first, second, None, None] + slack_mm
+        )
+        count = ((ok12.astype(np.float64) @ ok23) * ok13).sum(axis=1)
+        chunk = np.floor(np.cumsum(count) / _CHUNK).astype(np.intp)
+        for part in np.split(np.arange(len(xy_mm)), np.nonzero(np.diff(chunk))[0] + 1):
+            a, b, c = np.nonzero(ok12[part, :, None] & ok13[part, None, :] & ok23[None])
+            if len(a) > _ALONE:
+                yield np.array([row]), np.stack([part[a], b, c], axis=1)
+            elif len(a):
+                waiting.append((np.full(len(a), row), np.stack([part[a], b, c], axis=1)))
+    if waiting:
+        belongs, spots = (np.concatenate(column) for column in zip(*waiting, strict=True))
+        for begin in range(0, len(spots), _CHUNK):
+            yield belongs[begin : begin + _CHUNK], spots[begin : begin + _CHUNK]
 
 
 def _vote(
     model: RodModel, scene: Scene, T: FloatArray, rods: IntArray, spots: IntArray, least_matches: int
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Let the spots vote on poses made from three of them; returns score, pose and spot of each rod for the best."""
-    b, n = len(T), len(model)
+    """Let the spots vote on poses (b, 4, 4) made from three of them; returns score, pose and spots of rods of the best.
+
+    One vote fewer than ``least_matches`` is enough here: three noisy spots predict the others badly, and
+    :func:`verify` asks again with a better pose.
+    """
+    n, size = len(model), model.size_mm
     projection = project(T, model.starts, model.directions)
     seen, expected = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     could = (seen | expected).sum(axis=1) >= least_matches
-    T, spots, b = T[could], spots[could], int(could.sum())
+    mine = np.zeros((len(T), n), dtype=bool)
+    np.put_along_axis(mine, rods, True, axis=1)
+    others = np.nonzero(~mine)[1].reshape(len(T), n - 3)
+    row = np.arange(len(T))[:, None]
+    nearest, distance = _nearest_spots(scene.xy_mm, projection.xy_mm[row, others], spots)
+    hopeful = seen[row, others] & (distance < math.sqrt(_GATE2) * _WIDEST_GATE * size)
+    could &= hopeful.sum(axis=1) + 3 >= least_matches - 1
+    T, spots, nearest, hopeful, rods, others = (x[could] for x in (T, spots, nearest, hopeful, rods, others))
+    b, row = len(T), np.arange(len(T))[:, None]
     if b == 0:
         return np.empty(0), np.empty((0, 4, 4)), np.empty((0, n), dtype=np.intp)
     projection = project(T, model.starts, model.directions)
-    seen, expected = seen[could], expected[could]
     J = np.nan_to_num(motion_field(T, projection))
     k = np.nan_to_num(projection.slope)
     tolerance = (model.tolerances**2)[:, None, None] * (np.eye(2) + k[..., :, None] * k[..., None, :])
-    own = tolerance[:, rods] + scene.covariance_mm[spots]
-    J_own = J[:, rods].reshape(b, 6, 6)
-    WJ = (invert_2x2(own) @ J[:, rods]).reshape(b, 6, 6)
-    size = model.size_mm
-    information = np.swapaxes(J_own, 1, 2) @ WJ + np.diag([size**-2.0] * 3 + [1.0] * 3)
-    C = np.linalg.inv(information)
-    gate = J @ C[:, None] @ np.swapaxes(J, -1, -2) + tolerance + np.median(scene.covariance_mm, axis=0)
-    xy = np.nan_to_num(projection.xy_mm, nan=1e9)
-    gap2 = ((xy[:, :, None] - scene.xy_mm[None, None]) ** 2).sum(axis=-1)
-    for column in range(3):
-        gap2[np.arange(b), :, spots[:, column]] = np.inf  # a spot of the triple votes for its own rod only
-    nearest = gap2.argmin(axis=2)
-    r = scene.xy_mm[nearest] - xy
-    distance2 = np.einsum("bni,bnij,bnj->bn", r, invert_2x2(gate), r)
-    spread = np.sqrt(np.maximum(np.linalg.det(gate), 1e-300))
-    votes = seen & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
-    votes[:, rods] = False
+    own = tolerance[row, rods] + scene.covariance_mm[spots]
+    J_own, J = J[row, rods], J[row, others]
+    WJ = (invert_2x2(own) @ J_own).reshape(b, 6, 6)
+    information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + np.diag([size**-2.0] * 3 + [1.0] * 3)
+    JC = (J.reshape(b, -1, 6) @ np.linalg.inv(information)).reshape(J.shape)
+    gate = JC @ np.swapaxes(J, -1, -2) + tolerance[row, others] + np.median(scene.covariance_mm, axis=0)
+    r = scene.xy_mm[nearest] - np.nan_to_num(projection.xy_mm[row, others], nan=1e9)
+    det = np.maximum(gate[..., 0, 0] * gate[..., 1, 1] - gate[..., 0, 1] ** 2, 1e-300)
+    distance2 = (
+        gate[..., 1, 1] * r[..., 0] ** 2 - 2 * gate[..., 0, 1] * r[..., 0] * r[..., 1] + gate[..., 0, 0] * r[..., 1] ** 2
+    ) / det
+    spread = np.sqrt(det)
+    votes = hopeful & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
     density = len(scene.xy_mm) / max(float(np.prod(np.ptp(scene.xy_mm, axis=0))), 1e-9)
     gain = math.log(P_SEEN) - np.log(2 * math.pi * spread * density) - 0.5 * distance2
-    others = np.ones(n, dtype=bool)
-    others[rods] = False
-    score = np.where(votes, gain, np.where(expected & others, math.log(1 - P_SEEN), 0)).sum(axis=1)
-    enough = votes.sum(axis=1) + 3 >= least_matches
-    spot_of_rod = np.where(votes, nearest, -1)
-    spot_of_rod[:, rods] = spots
+    missed = math.log(1 - P_SEEN) * expected[could][row, others]
+    score = np.where(votes, gain, missed).sum(axis=1)
+    enough = votes.sum(axis=1) + 3 >= least_matches - 1
     top = np.nonzero(enough)[0]
-    top = top[np.argsort(-score[top], kind="stable")[:_KEEP_PER_TRIPLE]]
-    return score[top], T[top], spot_of_rod[top]
+    top = top[np.argsort(-score[top], kind="stable")[: 4 * _KEEP_PER_STAGE]]
+    spot_of_rod = np.full((len(top), n), -1, dtype=np.intp)
+    np.put_along_axis(spot_of_rod, others[top], np.where(votes[top], nearest[top], -1), axis=1)
+    np.put_along_axis(spot_of_rod, rods[top], spots[top], axis=1)
+    return score[top], T[top], spot_of_rod
+
+
+def _nearest_spots(spots_mm: FloatArray, crossings_mm: FloatArray, taken: IntArray) -> tuple[IntArray, FloatArray]:
+    """Nearest spot of each crossing (b, k, 2) and its distance, mm; a spot ``taken`` (b, 3) is infinitely far."""
+    crossings = np.nan_to_num(crossings_mm, nan=1e9)
+    if len(spots_mm) > _MANY_SPOTS:
+        from scipy.spatial import cKDTree
+
+        distance, nearest = cKDTree(spots_mm).query(crossings)
+        distance[(nearest[..., None] == taken[:, None]).any(axis=-1)] = np.inf
+        return nearest, distance
+    gap2 = (crossings[..., 0, None] - spots_mm[:, 0]) ** 2 + (crossings[..., 1, None] - spots_mm[:, 1]) ** 2
+    for column in taken.T:
+        gap2[np.arange(len(gap2)), :, column] = np.inf
+    nearest = gap2.argmin(axis=2)
+    return nearest, np.sqrt(np.take_along_axis(gap2, nearest[..., None], axis=2)[..., 0])
 
 
 def visibility(
@@ -550,8 +635,8 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     spot_of_rod = matches.spot_of_rod[row]
     matched = np.nonzero(spot_of_rod >= 0)[0]
     triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
-    if len(triples) > 40:  # many matches: twins are rare, and each of them shows in most triples
-        triples = triples[:: len(triples) // 40 + 1]
+    if len(triples) > _RESTARTS:  # many matches: twins are rare, and each of them shows in most triples
+        triples = triples[:: len(triples) // _RESTARTS + 1]
     noise = _noise_mm(model, scene)
     T, _ = solve_three(
         RodTriples.of(model, triples),
@@ -563,23 +648,27 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     if len(T) == 0:
         return None
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
-    # most of the starts are far off and say so at once
-    start = linearise(model, T, observations(scene, same))
-    T = T[np.argsort(start.chi2, kind="stable")[:60]]
-    T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=8, step_tolerance=1e-3)
-    T = T[np.argsort(fit.chi2, kind="stable")]
-    keep: list[int] = []
+    # most of the starts are far off and say so at once, most of the others after a few steps
+    for most, iterations in ((60, 3), (16, 6)):
+        T, fit, _ = refine(
+            model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3
+        )
+        T = T[np.argsort(fit.chi2, kind="stable")[:most]]
+        T = T[_distinct_poses(model, T)]
+    return weigh(model, scene, T[:8], np.array(same[: min(len(T), 8)]), least_matches)
+
+
+def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:
+    """Indices of poses (b, 4, 4) that differ by more than half a degree or a fiftieth of the frame, first come first."""
+    R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
+    turned = R @ R.T < 3 - 0.01**2  # trace(R_i R_jᵀ) = 1 + 2 cos
+    moved = np.linalg.norm(t[:, None] - t[None], axis=-1) > 0.02 * model.size_mm
+    differ = turned | moved
+    kept: list[int] = []
     for i in range(len(T)):
-        if len(keep) >= 8:
-            break
-        if not any(
-            poses.rotation_angle(T[i, :3, :3] @ T[j, :3, :3].T) < 0.01
-            and np.linalg.norm(T[i, :3, 3] - T[j, :3, 3]) < 0.02 * model.size_mm
-            for j in keep
-        ):
-            keep.append(i)
-    T = T[keep]
-    return weigh(model, scene, T, np.array(same[: len(T)]), least_matches)
+        if differ[i, kept].all():
+            kept.append(i)
+    return np.array(kept, dtype=np.intp)
 
 
 def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
