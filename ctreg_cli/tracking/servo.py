@@ -107,9 +107,12 @@ class View:
         return product
 
 
-def view(desired: Desired, T: FloatArray) -> View:
-    """The desired features from the pose ``T`` (4, 4); not finite where one of the rods lies in the slice."""
-    crossing = cross(T, desired.lines)
+def view(desired: Desired, T: FloatArray, crossing: Crossing | None = None) -> View:
+    """The desired features from the pose ``T`` (4, 4); not finite where one of the rods lies in the slice.
+
+    ``crossing``: of these rods with ``T``, where it has been worked out already.
+    """
+    crossing = crossing or cross(T, desired.lines)
     spots, jacobian, s = crossing.xy_mm, crossing.jacobian, desired.mm_per_px
     if s is not None:
         spots = spots / s
@@ -183,6 +186,7 @@ def servo(
     *,
     options: ServoOptions | None = None,
     jacobian: FloatArray | None = None,
+    crossing: Crossing | None = None,
     keep_path: bool = False,
 ) -> ServoResult:
     """Move the pose until its spots are the measured ones.
@@ -193,6 +197,7 @@ def servo(
         desired: s*.
         options: see :class:`ServoOptions`.
         jacobian: (2k, 6) Ĵ of the *constant* strategy; None: recomputed at every step (*updated*).
+        crossing: of the rods with ``T``, where it has been worked out already.
         keep_path: also return every pose and spot on the way.
 
     Raises:
@@ -200,7 +205,7 @@ def servo(
     """
     options = options or ServoOptions()
     unit = _unit(model.size_mm)
-    here = view(desired, T)
+    here = view(desired, T, crossing)
     law = _Law.of(here, jacobian)
     path = [(T, here, law.margin(here, model.size_mm))] if keep_path else []
     iterations = 0

@@ -265,8 +265,8 @@ class Tracker:
             return None, "no Jacobian has been kept yet"
         if len(scene.xy_mm) < CHECKABLE_MATCHES:
             return None, ""
-        T = prediction.T
-        spot_of_rod = Outlook(model, scene, T, prediction.crossing).assigned(prediction.covariance)
+        T, crossing = prediction.T, prediction.crossing
+        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -274,16 +274,24 @@ class Tracker:
             spots = spot_of_rod[rods]
             desired = Desired.of(model, rods, scene.xy_mm.take(spots, axis=0), scene.covariance_mm.take(spots, axis=0))
             kept = self._kept_jacobian[rods].reshape(-1, 6) if constant and self._kept_jacobian is not None else None
+            all_seen = len(rods) == len(model)
             try:
-                moved = servo(model, T, desired, options=self._servo_options, jacobian=kept)
+                moved = servo(
+                    model,
+                    T,
+                    desired,
+                    options=self._servo_options,
+                    jacobian=kept,
+                    crossing=crossing if all_seen else None,
+                )
             except np.linalg.LinAlgError:
                 return None, "the spots do not determine the pose"
             if not moved.converged:
                 return None, "the servo did not converge"
             T = moved.T
-            # all rods seen: the servo's last look is at all of them
-            outlook = Outlook(model, scene, T, moved.view.crossing if len(rods) == len(model) else None)
-            if len(rods) == len(model) == len(scene.xy_mm) and moved.view.chi2 < GATE_SD**2:
+            outlook = Outlook(model, scene, T, moved.view.crossing if all_seen else None)
+            crossing = outlook.crossing
+            if all_seen and len(rods) == len(scene.xy_mm) and moved.view.chi2 < GATE_SD**2:
                 break  # no rod or spot is left over, and none can be outside its gate
             again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):

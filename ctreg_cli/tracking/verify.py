@@ -115,10 +115,11 @@ def verified(
     distance2 = float(innovation @ solve_positive(S, innovation))
     if distance2 > _ODD_INNOVATION2:
         return None
-    odds = _log_odds(model, scene, crossings.xy_mm, moved, rods, missing, distance2, S)
+    odds = _log_odds(model, scene, crossings.xy_mm, moved, chi2, rods, missing, distance2, S)
     if not odds > ACCEPT_LOG_ODDS:
         return None
     residual = seen.residual_px / scale.mm_per_px
+    every_residual = residual.ravel()
     best = Candidate(
         T_slice_model=frozen(T, (4, 4)),
         covariance=frozen(C, (6, 6)),
@@ -128,7 +129,7 @@ def verified(
         lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
         missing_rods=frozen_index(missing),
         missing_px=frozen(crossings.xy_mm[missing] / scale.mm_per_px, (None, 2)),
-        rms_px=float(np.sqrt(np.mean(residual**2))),
+        rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
         log_odds=odds,
@@ -291,6 +292,7 @@ def _log_odds(
     scene: Scene,
     xy_mm: FloatArray,
     moved: ServoResult,
+    chi2: float,
     rods: IntArray,
     missing: IntArray,
     distance2: float,
@@ -310,7 +312,7 @@ def _log_odds(
         volume
         + n * (math.log(P_SEEN) - math.log(2 * math.pi))
         + 0.5 * log_weights
-        - 0.5 * moved.view.chi2
+        - 0.5 * chi2
         + n * math.log(math.pi * reach2)
         + math.lgamma(m - n + 0.5)
         - math.lgamma(m + 0.5)
