@@ -49,9 +49,9 @@ def update(T: FloatArray, twist: FloatArray) -> FloatArray:
 
 
 def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:
-    """The twist (6,) with ``update(T_from, twist) == T_to``; mm and rad."""
-    omega = Rotation.from_matrix(T_to[:3, :3] @ T_from[:3, :3].T).as_rotvec()
-    return np.concatenate([T_to[:3, 3] - T_from[:3, 3], omega])
+    """The twist (6,) with ``update(T_from, twist) == T_to``; mm and rad. ``T_to`` may be a stack (b, 4, 4): (b, 6)."""
+    omega = Rotation.from_matrix(T_to[..., :3, :3] @ T_from[:3, :3].T).as_rotvec()
+    return np.concatenate([T_to[..., :3, 3] - T_from[:3, 3], omega], axis=-1)
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
