@@ -1,8 +1,11 @@
 """What a spot looks like: a blurred, flat-topped ellipse on a tilted background, cut off where the scanner clips.
 
-``I(x) = a · 2^(−q^β) + b + g · x`` with ``q = |L (x − c)|²``: ``q = 1`` is the contour of half height, β = 1 a Gaussian
-(a rod thinner than the blur), larger β the flatter top of a thick rod or of a tilted one in a thick slab. The profile
-is even about its centre, so that no error in its shape can move the centre.
+``I(x) = a · 2^(−q^β) + b + g · x`` with ``q = |ξ|²``, ``ξ = L (x − c)``: ``q = 1`` is the contour of half height, β = 1
+a Gaussian (a rod thinner than the blur), larger β the flatter top of a thick rod or of a tilted one in a thick slab.
+The profile is even about its centre, so that no error in its shape can move the centre.
+
+Parameters are (10, k), a row each. Steps of a fit are taken in the spot's own coordinates, where the derivatives are
+products of ξ and η and all spots look alike: see :func:`moved`.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray
 
-#: order of the parameters (k, 10): centre u, v; ln a; b; g_u, g_v; L = [[e^l0, 0], [l1, e^l2]]; ln β
+#: order of the parameters: centre u, v; ln a; b; g_u, g_v; L = [[e^l0, 0], [l1, e^l2]]; ln β
 CENTRE: Final = slice(0, 2)
 LOG_HEIGHT: Final = 2
 BACKGROUND: Final = 3
@@ -27,44 +30,83 @@ _LN2 = float(np.log(2.0))
 _TINY = 1e-9
 
 
-def evaluate(
-    parameters: FloatArray, u: FloatArray, v: FloatArray, values: FloatArray, clipped: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals (k, p), measured minus profile, and the profile's Jacobian (k, 10, p).
+def moved(parameters: FloatArray, step: FloatArray) -> FloatArray:
+    """Parameters (10, k) after a ``step`` (10, k) in the spots' own coordinates.
 
-    A clipped pixel says only "at least this bright": where the profile is brighter still, its residual and its row of
-    the Jacobian are zero.
-
-    Args:
-        parameters: (k, 10), in the order given above.
-        u, v: (p,) pixel coordinates.
-        values, clipped: (k, p) measured values and whether they are cut off.
+    Its first two rows shift the contours by −L δc; rows 6 to 8 stretch them, ``δξ = e0 ξ``, ``δη = e1 ξ + e2 η``; the
+    others are added.
     """
-    centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, log_beta = parameters.T[:, :, None]
-    scale_u, scale_v, beta = np.exp(l0), np.exp(l2), np.exp(log_beta)
-    x, y = u - centre_u, v - centre_v
-    xi, eta = scale_u * x, l1 * x + scale_v * y
-    q = xi * xi + eta * eta + _TINY
-    log_q = np.log(q)
-    q_beta = np.exp(beta * log_q)
-    spot = np.exp(log_height - _LN2 * q_beta)
-    residuals = values - (spot + background + g_u * u + g_v * v)
-    steepness = _LN2 * beta * spot * q_beta
-    d_q = -2 * steepness / q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
-    d_xi, d_eta = d_q * xi, d_q * eta
-    jacobian = np.empty((len(parameters), N_PARAMETERS, u.size))
-    jacobian[:, 0] = -(d_xi * scale_u + d_eta * l1)
-    jacobian[:, 1] = -d_eta * scale_v
-    jacobian[:, LOG_HEIGHT] = spot
-    jacobian[:, BACKGROUND] = 1.0
-    jacobian[:, 4] = u
-    jacobian[:, 5] = v
-    jacobian[:, 6] = d_xi * xi
-    jacobian[:, 7] = d_eta * x
-    jacobian[:, 8] = d_eta * scale_v * y
-    jacobian[:, LOG_BETA] = -steepness * log_q
-    satisfied = clipped & (residuals <= 0)
-    if satisfied.any():
-        residuals[satisfied] = 0.0
-        jacobian *= ~satisfied[:, None]
-    return residuals, jacobian
+    l0, l1, _ = parameters[SHAPE]
+    after = parameters + step
+    after[:2] = parameters[:2] + in_pixels(parameters, step[:2])
+    after[7] = l1 + step[7] * np.exp(l0) + l1 * step[8]
+    return after
+
+
+def in_pixels(parameters: FloatArray, shift: FloatArray) -> FloatArray:
+    """What a ``shift`` (2, k, ...) in the spots' own coordinates moves the centres by, px: −L⁻¹ shift."""
+    l0, l1, l2 = parameters[SHAPE].reshape(3, -1, *(1,) * (shift.ndim - 2))
+    pixels = np.empty_like(shift)
+    pixels[0] = -np.exp(-l0) * shift[0]
+    pixels[1] = -np.exp(-l2) * (shift[1] + l1 * pixels[0])
+    return pixels
+
+
+class Rows:
+    """Weighted residuals and derivatives of ``k`` profiles at the ``p`` pixels of their windows.
+
+    Every number is multiplied by the root of its pixel's weight, so that one matrix product makes the normal equations.
+    """
+
+    def __init__(
+        self, u: FloatArray, v: FloatArray, values: FloatArray, clipped: BoolArray | None, root_weights: FloatArray
+    ) -> None:
+        """Take pixel coordinates ``u``, ``v`` (p,), ``values``, whether they are ``clipped``, and roots of weights.
+
+        The last three are (k, p); ``clipped`` is None where nothing is.
+        """
+        self._u, self._v, self._clipped, self.root_weights = u, v, clipped, root_weights
+        self._weighted_values = values * root_weights
+        self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
+        self._rows[3], self._rows[4], self._rows[5] = root_weights, root_weights * u, root_weights * v
+        #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
+        self.by_spot = self._rows.transpose(1, 0, 2)
+
+    def evaluate(self, parameters: FloatArray) -> FloatArray:
+        """Fill :attr:`by_spot` for ``parameters`` (10, k); products of its rows (k, 11, 11), summed over the pixels.
+
+        These hold the normal matrix, in the last column the gradient, in the last place the sum of squares. A clipped
+        pixel says only "at least this bright": where the profile is brighter still, it takes no part.
+        """
+        rows = self._rows
+        centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, log_beta = parameters[:, :, None]
+        x = self._u - centre_u
+        xi = np.exp(l0) * x
+        eta = np.exp(l2) * (self._v - centre_v)
+        eta += l1 * x
+        q = xi * xi
+        q += eta * eta
+        q += _TINY
+        log_q = np.log(q)
+        beta = np.exp(log_beta)
+        steepness = np.exp(beta * log_q)
+        spot = np.exp(log_height - _LN2 * steepness, out=rows[LOG_HEIGHT])
+        spot *= self.root_weights
+        steepness *= spot
+        steepness *= -2.0 * _LN2 * beta
+        np.multiply(0.5 * steepness, log_q, out=rows[LOG_BETA])
+        steepness /= q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
+        d_xi = np.multiply(steepness, xi, out=rows[0])
+        d_eta = np.multiply(steepness, eta, out=rows[1])
+        np.multiply(d_xi, xi, out=rows[6])
+        np.multiply(d_xi, eta, out=rows[7])
+        np.multiply(d_eta, eta, out=rows[8])
+        residuals = np.subtract(self._weighted_values, spot, out=rows[-1])
+        residuals -= background * rows[BACKGROUND]
+        residuals -= g_u * rows[4]
+        residuals -= g_v * rows[5]
+        self.by_spot = rows.transpose(1, 0, 2)
+        if self._clipped is not None:
+            satisfied = self._clipped & (residuals <= 0)
+            self.by_spot = np.where(satisfied[:, None], 0.0, self.by_spot)
+        return np.asarray(self.by_spot @ self.by_spot.transpose(0, 2, 1))

@@ -35,8 +35,8 @@ class SliceInfo:
     shape: tuple[int, int] | None = None
     #: opaque key: slices of one series share it; tracking never runs across a change
     series: str = ""
-    #: UIDs (``sop_instance``, ``series_instance``, ``study_instance``, ``frame_of_reference``), for ``--with-uids``
-    #: only
+    #: UIDs (``sop_class``, ``sop_instance``, ``series_instance``, ``study_instance``, ``frame_of_reference``), for
+    #: ``--with-uids`` only
     uids: Mapping[str, str] = field(default_factory=dict)
 
 
