@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 from datetime import datetime
 from typing import TYPE_CHECKING
 
@@ -24,9 +25,10 @@ if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
 SPATIAL_REGISTRATION_CLASS = "1.2.840.10008.5.1.4.1.1.66.1"
-CT_IMAGE_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 _UID_BYTES = 16
-_NEEDED = ("sop_instance", "series_instance", "study_instance", "frame_of_reference")
+_NEEDED = ("sop_class", "sop_instance", "series_instance", "study_instance", "frame_of_reference")
+#: PS3.5 9.1
+_UID = re.compile(r"(?=.{1,64}\Z)(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*))+")
 
 
 def spatial_registration(content: Content, record: SliceRecord, *, now: datetime | None = None) -> bytes:
@@ -44,10 +46,10 @@ def spatial_registration(content: Content, record: SliceRecord, *, now: datetime
     from pydicom.filewriter import dcmwrite
     from pydicom.uid import UID, ExplicitVRLittleEndian
 
-    missing = [name for name in _NEEDED if not record.uids.get(name)]
+    missing = [name for name in _NEEDED if not _UID.fullmatch(record.uids.get(name, ""))]
     if missing:
         raise InputError(
-            f"{content.document.name}: slice {record.index} has no {missing[0]} UID, which a DICOM registration refers "
+            f"{content.document.name}: slice {record.index} has no valid {missing[0]} UID, which a DICOM registration refers "
             "to; write the results from DICOM slices with --with-uids -o results.json"
         )
     if content.space != "patient":
@@ -121,7 +123,7 @@ def _image_reference(record: SliceRecord) -> Dataset:
     from pydicom.dataset import Dataset
 
     image = Dataset()
-    image.ReferencedSOPClassUID = record.uids.get("sop_class") or CT_IMAGE_CLASS
+    image.ReferencedSOPClassUID = record.uids["sop_class"]
     image.ReferencedSOPInstanceUID = record.uids["sop_instance"]
     frame = record.source.rpartition("#")[2]
     if "#" in record.source and frame.isdecimal():

@@ -44,6 +44,7 @@ _CAPTURE_WORDS = frozenset({"SCREEN SAVE", "SCREENSAVE", "PROTOCOL", "DOSE_INFO"
 _CAPTURE_CLASSES = "1.2.840.10008.5.1.4.1.1.7"
 _DIRECTORY_CLASS = "1.2.840.10008.1.3.10"
 _UIDS = {
+    "sop_class": "SOPClassUID",
     "sop_instance": "SOPInstanceUID",
     "series_instance": "SeriesInstanceUID",
     "study_instance": "StudyInstanceUID",

@@ -214,13 +214,15 @@ def _evidence(result: FrameResult, header: ResultsHeader) -> dict[str, object]:
     candidates = accepted(result)
     best = candidates[0] if candidates else None
     matched = set(best.spot_index.tolist()) if best else set()
+    unmatched = [spot for spot in range(len(result.spots)) if spot not in matched]
     ids = header.model.ids
     return {
         "T_slice_model": best.T_slice_model if best else None,
         "T_patient_model": _in_patient(result, best.T_slice_model) if best else None,
         "covariance": best.covariance if best else None,
         "matches": _matches(best, result, header) if best else [],
-        "unmatched_spots": [spot for spot in range(len(result.spots)) if spot not in matched],
+        "unmatched_spots": unmatched,
+        "unmatched_px": result.spots.uv_px[unmatched],
         "missing_rods": [ids[rod] for rod in best.missing_rods] if best else [],
         "candidates": [_alternative(candidate, result, header) for candidate in candidates],
         "targets": [

@@ -69,6 +69,8 @@ class SliceRecord:
     #: (6, 6) of the twist ``[V; Ω]``, mm and rad; None without a pose, and in a pose table
     covariance: FloatArray | None
     matches: tuple[MatchRecord, ...]
+    #: (k, 2) the spots no rod was matched to, px; none where the results do not say
+    unmatched_px: FloatArray
     missing_rods: tuple[str, ...]
     targets: tuple[TargetRecord, ...]
     #: code and explanation
@@ -130,6 +132,7 @@ def _covariance(rows: list[list[float]]) -> FloatArray:
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+_Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 _Row4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 _Row6 = Annotated[list[Finite], Field(min_length=6, max_length=6)]
 Matrix4 = Annotated[list[_Row4], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
@@ -165,6 +168,7 @@ class _Result(_Loose):
     T_patient_model: Matrix4 | None = None
     covariance: Matrix6 | None = None
     matches: list[MatchRecord] = []
+    unmatched_px: list[_Pair] = []
     missing_rods: list[str] = []
     targets: list[_Target] = []
     warnings: list[_Warning] = []
@@ -216,6 +220,7 @@ def read_document(path: str | Path) -> ResultsDocument:
                     T_patient_model=None,
                     covariance=None,
                     matches=(),
+                    unmatched_px=frozen([], (0, 2)),
                     missing_rods=(),
                     targets=(),
                     warnings=tuple((code, "") for code in row.cells.get("warnings", "").split(";") if code),
@@ -322,6 +327,7 @@ def _record(entry: _Result, raw: Mapping[str, object]) -> SliceRecord:
         T_patient_model=entry.T_patient_model if has_pose else None,  # type: ignore[arg-type]
         covariance=entry.covariance if has_pose else None,  # type: ignore[arg-type]
         matches=tuple(entry.matches),
+        unmatched_px=frozen(np.reshape(entry.unmatched_px, (-1, 2)), (None, 2)),
         missing_rods=tuple(entry.missing_rods),
         targets=tuple(
             TargetRecord(

@@ -63,6 +63,7 @@ def document_text(seed: int = 0, *, with_uids: bool = True, patient: bool = True
             row |= dict(zip(("sd_rx_deg", "sd_ry_deg", "sd_rz_deg"), np.degrees(sd[3:]).tolist(), strict=True))
             row["rms_px"] = 0.1
         uids = {
+            "sop_class": "1.2.840.10008.5.1.4.1.1.2",
             "sop_instance": f"2.25.{1000 + index}",
             "series_instance": "2.25.10",
             "study_instance": "2.25.11",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import shutil
 import subprocess
@@ -14,14 +15,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pydicom
 import pytest
+from pydicom.uid import EnhancedCTImageStorage, MRImageStorage
 
 from ctreg_cli.interop.exports import write_export
-from ctreg_cli.interop.selection import select
-from ctreg_cli.io.results_document import read_document
 
-from .documents import frame, written
 from .senders import LIMIT_S, SAMPLES, SLICES, free_port
+from .sources import image_of_class
+from .test_registration_object import posed
 
 ORTHANC = shutil.which("Orthanc")
 pytestmark = pytest.mark.skipif(ORTHANC is None, reason="Debian package orthanc is not installed")
@@ -76,18 +78,22 @@ def orthanc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Orthanc]:
             process.wait(LIMIT_S)
 
 
-def test_registration_is_kept_and_returned(orthanc: Orthanc, tmp_path: Path) -> None:
-    import io
-
-    import pydicom
-
-    content = select(read_document(written(tmp_path)), model=frame())
-    (path,) = write_export(str(tmp_path / "r.dcm"), content, index=0)
-    stored = orthanc.call("/instances", path.read_bytes())
-    assert stored["Status"] == "Success"
-    back = pydicom.dcmread(io.BytesIO(orthanc.call(f"/instances/{stored['ID']}/file")))
+@pytest.mark.parametrize("sop_class", [MRImageStorage, EnhancedCTImageStorage])
+def test_registration_is_kept_and_returned(orthanc: Orthanc, tmp_path: Path, sop_class: str) -> None:
+    """It is of the image's study, and refers to the image; the patient's fields stay empty."""
+    image = image_of_class(sop_class, tmp_path)
+    (path, *_) = write_export(str(tmp_path / "r_{slice}.dcm"), posed(image))
+    kept = [orthanc.call("/instances", file.read_bytes()) for file in (image, path)]
+    assert {answer["Status"] for answer in kept} <= {"Success", "AlreadyStored"}
+    back = pydicom.dcmread(io.BytesIO(orthanc.call(f"/instances/{kept[1]['ID']}/file")))
     assert back == pydicom.dcmread(path)
-    assert orthanc.call(f"/instances/{stored['ID']}/simplified-tags")["Modality"] == "REG"
+    (reference,) = back.RegistrationSequence[0].ReferencedImageSequence
+    source = pydicom.dcmread(io.BytesIO(orthanc.call(f"/instances/{kept[0]['ID']}/file")))
+    assert (back.StudyInstanceUID, back.PatientID) == (source.StudyInstanceUID, "")
+    assert (reference.ReferencedSOPClassUID, reference.ReferencedSOPInstanceUID) == (sop_class, source.SOPInstanceUID)
+    assert orthanc.call(f"/instances/{kept[1]['ID']}/simplified-tags")["Modality"] == "REG"
+    for answer in kept:
+        orthanc.call(f"/instances/{answer['ID']}", method="DELETE")
 
 
 @pytest.mark.skipif(shutil.which("movescu") is None, reason="Debian package dcmtk is not installed")

@@ -160,15 +160,17 @@ def test_the_document_is_strict_and_holds_the_evidence(tmp_path: Path, results: 
     assert [(match["rod"], match["spot"]) for match in first["matches"]] == [("r0", 4), ("r1", 0), ("r3", 2)]
     assert [first["matches"][0][key] for key in ("u_px", "v_px")] == results[0].spots.uv_px[4].tolist()
     assert first["unmatched_spots"] == [1, 3]
+    assert first["unmatched_px"] == results[0].spots.uv_px[[1, 3]].tolist()
     assert first["missing_rods"] == ["r2"]
     assert first["targets"][0]["tre_mm"] == 0.5
     assert first["warnings"][0] == {"code": "weak_geometry", "text": "tilt is known to 9° only"}
     assert len(second["candidates"]) == 2
     assert all(item["rms_px"] == 0.123456789 for item in second["candidates"])
-    for lost in (third, fourth):
+    for lost, result in ((third, results[2]), (fourth, results[3])):
         assert lost["T_slice_model"] is lost["T_patient_model"] is lost["covariance"] is lost["qw"] is None
         assert lost["matches"] == lost["candidates"] == lost["missing_rods"] == []
         assert lost["unmatched_spots"] == [0, 1, 2, 3, 4]
+        assert lost["unmatched_px"] == result.spots.uv_px.tolist()
 
 
 def test_table_and_document_say_the_same(tmp_path: Path, results: list[FrameResult]) -> None:
