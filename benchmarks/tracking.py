@@ -1,67 +1,314 @@
 """How the tracker does on simulated sequences of spots: wrong poses, share of ``ok``, error against the bound.
 
-    python benchmarks/tracking.py [--sequences 200] [--slices 150] [--jacobian updated]
+    python -m benchmarks.tracking [--sequences 200] [--slices 150] [--jacobian updated|constant|both]
+    python -m benchmarks.tracking --smooth             breathing at ten slices a period, smoothed
 
-Scenes come from ``tests/oracle.py``, which shares no code with the package.
+Sequences come from ``tests/tracking/sequences.py``, which shares no code with the package; so does what is *decidable*:
+
+* at least five rods left a spot, and without any one of these spots the pose would still be known (20 mm, 20 degrees);
+* the cost of the true match, fitted by SciPy, rises three sd from its lowest point by half to twice of what an
+  ellipsoid promises (else no covariance describes what is known);
+* the oracle's odds of the true match exceed 100 : 1 over chance and over every variant (a spot dropped, added, given to
+  another rod, two exchanged) whose pose lies more than 6 sd away. The oracle knows the slice before to 2 mm and
+  2 degrees where the frame did not jump.
+
+The oracle is asked about every slice that the tracker did not settle, and about every twentieth that it did.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
-
+from benchmarks.accuracy import DECIDABLE, WRONG_SD, fitted, oracle_log_odds
 from ctreg_cli import pipeline
+from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import TrackingOptions
-from tests.tracking.sequences import error_of, is_wrong, sequence
+from tests.oracle import OracleScene, bound, cross_line, numeric_jacobian, twist_error
+from tests.tracking.sequences import Sequence, TrueSlice, error_of, is_wrong, sequence
 
-#: a slice is decidable when so many rods left a spot, and these bound every turn by so much (sd, rad): beyond, the
-#: problem is not linear, and no pose with a covariance can be stated
-DECIDABLE_RODS, DECIDABLE_SD_RAD = 5, math.radians(3.0)
+#: five spots are the fewest that leave something to check them by
+DECIDABLE_RODS = 5
+#: how well the oracle knows where the frame was before, mm and rad
+PAST_SD = np.repeat([2.0, math.radians(2.0)], 3)
+#: worst sd without any one of the spots, at the frame's middle, mm and rad
+KNOWN_MM, KNOWN_RAD = 20.0, math.radians(20.0)
+#: rise of χ² at three sd, where an ellipsoid promises 9
+LEAST_RISE, MOST_RISE = 4.5, 18.0
+#: spots farther than this from a rod's crossing are not tried with it, px
+NEAR_PX = 25.0
+#: one in so many settled slices is put to the oracle
+SAMPLED = 20
 
 
-def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> dict[str, object]:
-    """One sequence: counts, squared errors in units of the bound, and what went wrong."""
+@dataclass
+class Tally:
+    """What is counted over sequences."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    #: squared errors, and bounds, by axis; normalised squared errors by the pose's own covariance
+    squares: list[np.ndarray] = field(default_factory=list)
+    bounds: list[np.ndarray] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def add(self, other: Tally) -> None:
+        self.counts.update(other.counts)
+        for name in ("squares", "bounds", "nees", "notes"):
+            getattr(self, name).extend(getattr(other, name))
+        self.seconds += other.seconds
+
+
+# --- the oracle -------------------------------------------------------------------------------------------------------
+
+
+def is_decidable(made: Sequence, i: int, sd_px: float) -> bool:
+    """Whether the spots of slice ``i``, and where the frame was before, leave no doubt (see the module's docstring)."""
+    true = made.truth[i]
+    if len(true.rods) < DECIDABLE_RODS:
+        return False
+    before = None if i == 0 or true.has_jumped else made.truth[i - 1]
+    world = _world(made, i, sd_px)
+    rods, spots = true.rods, true.spots
+    R, t = fitted(made.frame, world, true.R, true.t, rods, spots)
+    own = bound(made.frame, rods, R, t, world.mm_per_px, sd_px)
+    if not all(is_known(made, world, R, t, [r for r in rods if r != left_out]) for left_out in rods):
+        return False
+    if not all(LEAST_RISE <= rise <= MOST_RISE for rise in rises(made, world, R, t, rods, spots, own)):
+        return False
+    odds = _log_odds(made, world, R, t, rods, spots, before)
+    if odds < DECIDABLE:
+        return False
+    information = np.linalg.pinv(own, hermitian=True)
+    for other_rods, other_spots in variants(made, world, R, t, rods, spots):
+        R1, t1 = fitted(made.frame, world, R, t, other_rods, other_spots)
+        apart = twist_error(R1, t1, R, t)
+        if apart @ information @ apart > WRONG_SD**2:
+            rival = _log_odds(made, world, R1, t1, other_rods, other_spots, before)
+            if rival > odds - DECIDABLE:
+                return False
+    return True
+
+
+def _world(made: Sequence, i: int, sd_px: float) -> OracleScene:
+    true, spots = made.truth[i], made.slices[i].spots
+    scale = made.slices[i].info.scale
+    rod_of_spot = np.full(len(spots), -1)
+    rod_of_spot[true.spots] = true.rods
+    return OracleScene(
+        R=true.R,
+        t=true.t,
+        uv_px=np.array(spots.uv_px),
+        sd_px=sd_px,
+        rod_of_spot=rod_of_spot,
+        mm_per_px=np.array([scale.s_x, scale.s_y]),
+        bound=true.bound,
+    )
+
+
+def _log_odds(
+    made: Sequence,
+    world: OracleScene,
+    R: np.ndarray,
+    t: np.ndarray,
+    rods: list[int],
+    spots: list[int],
+    before: TrueSlice | None,
+) -> float:
+    """The oracle's odds; where the frame was before takes the place of "anywhere"."""
+    odds = oracle_log_odds(made.frame, world, R, t, rods, spots)
+    if before is None:
+        return odds
+    moved = _about_middle(made, R, t, before.R, before.t) / PAST_SD
+    density = -0.5 * float(moved @ moved) - 3 * math.log(2 * math.pi) - float(np.log(PAST_SD).sum())
+    predicted = np.array([cross_line(made.frame.starts[i], made.frame.ends[i], R, t) / world.mm_per_px for i in rods])
+    reach = 1.25 * np.linalg.norm(predicted - predicted.mean(axis=0), axis=1).max()
+    area = max(math.pi * reach**2, float(np.prod(np.ptp(world.uv_px, axis=0)))) * float(np.prod(world.mm_per_px))
+    size = np.linalg.norm(made.frame.starts - made.frame.ends, axis=1).mean()
+    anywhere = -math.log(area * size * 8 * math.pi**2)
+    return odds - anywhere + density
+
+
+def _about_middle(made: Sequence, R: np.ndarray, t: np.ndarray, R0: np.ndarray, t0: np.ndarray) -> np.ndarray:
+    middle = (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2
+    return twist_error(R, R @ middle + t, R0, R0 @ middle + t0)
+
+
+def variants(
+    made: Sequence, world: OracleScene, R: np.ndarray, t: np.ndarray, rods: list[int], spots: list[int]
+) -> list[tuple[list[int], list[int]]]:
+    """One match dropped, added or given another spot, or two exchanged, where the spots lie near enough."""
+    crossing = np.array(
+        [cross_line(a, b, R, t) / world.mm_per_px for a, b in zip(made.frame.starts, made.frame.ends, strict=True)]
+    )
+    near = np.linalg.norm(crossing[:, None] - world.uv_px, axis=2) < NEAR_PX
+    free = [j for j in range(len(world.uv_px)) if j not in spots]
+    found: list[dict[int, int]] = []
+    match = dict(zip(rods, spots, strict=True))
+    found += [{r: s for r, s in match.items() if r != rod} for rod in rods]
+    found += [match | {rod: j} for rod in range(len(crossing)) for j in free if near[rod, j]]
+    for a in rods:
+        for b in range(len(crossing)):
+            if near[b, match[a]] and b not in match:  # another rod takes the spot
+                found.append({r: s for r, s in match.items() if r != a} | {b: match[a]})
+            elif b in match and a < b and near[b, match[a]] and near[a, match[b]]:
+                found.append(match | {a: match[b], b: match[a]})
+    return [(list(f), list(f.values())) for f in found if len(f) >= 3]
+
+
+def is_known(made: Sequence, world: OracleScene, R: np.ndarray, t: np.ndarray, rods: list[int]) -> bool:
+    """Whether these rods alone bound the pose."""
+    C = bound(made.frame, rods, R, t, world.mm_per_px, world.sd_px)
+    middle = R @ (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2
+    G = np.hstack([np.eye(3), np.cross(middle, np.eye(3))])
+    place, turn = (math.sqrt(np.linalg.eigvalsh(c)[-1]) for c in (G @ C @ G.T, C[3:, 3:]))
+    return place <= KNOWN_MM and turn <= KNOWN_RAD
+
+
+def rises(
+    made: Sequence,
+    world: OracleScene,
+    R: np.ndarray,
+    t: np.ndarray,
+    rods: list[int],
+    spots: list[int],
+    own: np.ndarray,
+) -> list[float]:
+    """How much χ² rises three sd up and down the worst-known direction, the others giving way."""
+    frame, s = made.frame, world.mm_per_px
+    size = np.linalg.norm(frame.starts - frame.ends, axis=1).mean() / 2
+    unit = np.array([1, 1, 1, size, size, size])
+    values, vectors = np.linalg.eigh(own * np.outer(unit, unit))
+
+    def residual(R1: np.ndarray, t1: np.ndarray) -> np.ndarray:
+        predicted = np.concatenate([cross_line(frame.starts[i], frame.ends[i], R1, t1) / s for i in rods])
+        return np.asarray((world.uv_px[spots].ravel() - predicted) / world.sd_px)
+
+    def turned(R1: np.ndarray, t1: np.ndarray, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return Rotation.from_rotvec(twist[3:]).as_matrix() @ R1, t1 + twist[:3]
+
+    found = []
+    lowest = float(residual(R, t) @ residual(R, t))
+    for sign in (-1, 1):
+        R1, t1 = turned(R, t, sign * 3 * math.sqrt(max(values[-1], 0)) * vectors[:, -1] / unit)
+        basis = vectors[:, :-1] / unit[:, None]
+        for _ in range(4):
+            J = numeric_jacobian(frame, rods, R1, t1, s) @ basis / world.sd_px
+            R1, t1 = turned(R1, t1, basis @ np.linalg.lstsq(J, residual(R1, t1), rcond=None)[0])
+        found.append(float(residual(R1, t1) @ residual(R1, t1)) - lowest)
+    return found
+
+
+# --- the experiment ---------------------------------------------------------------------------------------------------
+
+
+def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> Tally:
+    """One sequence."""
     made = sequence(seed, n=n, sd_px=sd_px)
-    counts: Counter[str] = Counter()
-    nees, squares, bounds, notes = [], [], [], []
+    tally = Tally()
     began = time.perf_counter()
     results = list(pipeline.track(made.slices, made.model, options=TrackingOptions(jacobian=jacobian)))
-    seconds = time.perf_counter() - began
+    tally.seconds = time.perf_counter() - began
     for i, (result, true) in enumerate(zip(results, made.truth, strict=True)):
-        decidable = len(true.rods) >= DECIDABLE_RODS and true.bound is not None
-        decidable = decidable and math.sqrt(np.linalg.eigvalsh(true.bound[3:, 3:])[-1]) <= DECIDABLE_SD_RAD
-        counts["decidable"] += decidable
-        counts[f"{result.status}:{result.method or result.reason}"] += 1
-        if decidable and result.status != "ok":
-            counts["undecided"] += 1
-            counts[
-                f"undecided with {len(true.rods)} rods{' after a jump' if true.has_jumped else ''}: {result.reason}"
-            ] += 1
-        if result.status == "ok":
+        tally.counts[f"{result.status}:{result.method or result.reason}"] += 1
+        if result.status != "ok":
+            if is_decidable(made, i, sd_px):
+                tally.counts["undecided, though decidable"] += 1
+                after = " after a jump" if true.has_jumped else ""
+                tally.counts[f"  with {len(true.rods)} rods{after}: {result.reason}"] += 1
+                tally.notes.append(f"undecided: seed {seed} slice {i} {len(true.rods)} rods{after}: {result.reason}")
+            continue
+        best = result.candidates[0]
+        error = error_of(best.T_slice_model, true)
+        tally.nees.append(float(error @ np.linalg.pinv(best.covariance, hermitian=True) @ error))
+        own = is_wrong(best.T_slice_model, best.covariance, true)
+        true_bound = true.bound if true.bound is not None else np.full((6, 6), np.inf)
+        beyond = is_beyond_bound(made, true, best.T_slice_model)
+        tally.counts["wrong: beyond 6 sd of the bound"] += beyond
+        tally.counts["wrong: beyond its own covariance"] += own
+        if own or beyond:
+            tally.notes.append(
+                f"WRONG: seed {seed} slice {i} {result.method} {len(true.rods)} rods, {len(best.rod_index)} matches: "
+                f"{np.linalg.norm(error[:3]):.2f} mm {np.degrees(np.linalg.norm(error[3:])):.2f} deg "
+                f"nees {tally.nees[-1]:.0f} odds {best.log_odds:.1f} bound {beyond} own {own}"
+            )
+        tally.counts["ok"] += 1
+        if (seed * n + i) % SAMPLED == 0:
+            tally.counts["sampled"] += 1
+            if is_decidable(made, i, sd_px):
+                tally.counts["sampled and decidable"] += 1
+                tally.squares.append(error**2)
+                tally.bounds.append(np.diag(true_bound))
+    return tally
+
+
+def is_beyond_bound(made: Sequence, true: TrueSlice, T: np.ndarray) -> bool:
+    """Whether a pose lies more than six sd of the bound from the truth, in rotation or at the frame's middle."""
+    if true.bound is None:
+        return True
+    middle = true.R @ (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2
+    G = np.hstack([np.eye(3), np.cross(middle, np.eye(3))])
+    error = _about_middle(made, T[:3, :3], T[:3, 3], true.R, true.t)
+    place, turn = np.trace(G @ true.bound @ G.T), np.trace(true.bound[3:, 3:])
+    return bool(error[:3] @ error[:3] > WRONG_SD**2 * place or error[3:] @ error[3:] > WRONG_SD**2 * turn)
+
+
+def report(jacobian: str, sequences: int, n: int, tally: Tally) -> None:
+    """Print one table."""
+    print(f"{jacobian}: {sequences} sequences of {n} slices")
+    for note in tally.notes:
+        print(" ", note)
+    for name, count in sorted(tally.counts.items()):
+        print(f"  {name:50} {count}")
+    counts = tally.counts
+    decidable_ok = counts["ok"] * counts["sampled and decidable"] / max(counts["sampled"], 1)
+    share = decidable_ok / max(decidable_ok + counts["undecided, though decidable"], 1)
+    print(f"  decidable slices that are ok: {share:.4f} (goal 0.99)")
+    squares, bounds = np.array(tally.squares), np.array(tally.bounds)
+    ratio = np.sqrt(np.mean(squares / bounds, axis=0))
+    print(f"  error / bound by axis {ratio.round(3)}, all {np.sqrt(np.mean(ratio**2)):.3f} (goal 1.05; {len(bounds)})")
+    print(f"  mean NEES {np.mean(tally.nees):.2f} (6), {1e3 * tally.seconds / (sequences * n):.1f} ms a slice")
+
+
+def table_smooth(sequences: int, sd_px: float) -> None:
+    """Breathing at ten slices a period: the smoothed error beside that of each slice on its own, and its covariance."""
+    single, bounds, after, nees = [], [], [], []
+    for seed in range(sequences):
+        made = sequence(
+            seed,
+            kind="breathing",
+            n=80,
+            model=load_rod_model("rod-cube-30x30x40"),
+            sd_px=sd_px,
+            p_missing=0.0,
+            most_false=0,
+            interval_s=0.4,
+            period_s=4.0,
+        )
+        tracked = list(pipeline.track(made.slices, made.model))
+        for before, result, true in zip(tracked, pipeline.smoothed(tracked, made.model), made.truth, strict=True):
+            if result.status != "ok" or true.bound is None:
+                continue
             best = result.candidates[0]
             error = error_of(best.T_slice_model, true)
-            nees.append(error @ np.linalg.pinv(best.covariance, hermitian=True) @ error)
-            if is_wrong(best.T_slice_model, best.covariance, true):
-                counts["wrong"] += 1
-                notes.append(
-                    f"seed {seed} slice {i} {result.method} {len(true.rods)} rods, {len(best.rod_index)} matches: "
-                    f"{np.linalg.norm(error[:3]):.2f} mm {np.degrees(np.linalg.norm(error[3:])):.2f} deg "
-                    f"nees {nees[-1]:.0f} odds {best.log_odds:.1f}"
-                )
-            if decidable:
-                squares.append(error**2)
-                bounds.append(np.diag(true.bound))
-    return {"counts": counts, "nees": nees, "squares": squares, "bounds": bounds, "notes": notes, "seconds": seconds}
+            nees.append(error @ np.linalg.solve(best.covariance, error))
+            after.append(error**2)
+            single.append(error_of(before.candidates[0].T_slice_model, true) ** 2)
+            bounds.append(np.diag(true.bound))
+    alone, smooth = (np.sqrt(np.mean(np.array(e) / np.array(bounds), axis=0)) for e in (single, after))
+    print(f"breathing, 10 slices a period, {sequences} sequences of 80 slices: rms error / single-slice bound")
+    print(f"  each slice alone {alone.round(3)}, all {np.sqrt(np.mean(alone**2)):.3f}")
+    print(f"  smoothed         {smooth.round(3)}, all {np.sqrt(np.mean(smooth**2)):.3f} (goal 0.70)")
+    print(f"  mean NEES of the smoothed poses {np.mean(nees):.2f} (6)")
 
 
 def main() -> None:
@@ -70,29 +317,21 @@ def main() -> None:
     parser.add_argument("--sequences", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--slices", type=int, default=150)
-    parser.add_argument("--jacobian", default="updated")
+    parser.add_argument("--jacobian", default="both", choices=["updated", "constant", "both"])
     parser.add_argument("--sd", type=float, default=0.3)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--smooth", action="store_true")
     a = parser.parse_args()
-    counts: Counter[str] = Counter()
-    nees, squares, bounds, seconds = [], [], [], 0.0
-    job = partial(run, n=a.slices, jacobian=a.jacobian, sd_px=a.sd)
-    with ProcessPoolExecutor(a.workers) as pool:
-        for part in pool.map(job, range(a.first, a.first + a.sequences)):
-            counts.update(part["counts"])
-            nees += part["nees"]
-            squares += part["squares"]
-            bounds += part["bounds"]
-            seconds += part["seconds"]
-            for note in part["notes"]:
-                print("WRONG", note)
-    for name, count in sorted(counts.items()):
-        print(f"{name:50} {count}")
-    total = a.sequences * a.slices
-    print(f"decidable slices that are ok: {1 - counts['undecided'] / max(counts['decidable'], 1):.4f}")
-    ratio = np.sqrt(np.mean(squares, axis=0) / np.mean(bounds, axis=0))
-    print("error / bound by axis", ratio.round(3), "all", np.sqrt(np.mean(ratio**2)).round(3))
-    print(f"mean NEES {np.mean(nees):.2f} (6), {1e3 * seconds / total:.1f} ms a slice")
+    if a.smooth:
+        table_smooth(min(a.sequences, 40), a.sd)
+        return
+    for jacobian in ("updated", "constant") if a.jacobian == "both" else (a.jacobian,):
+        total = Tally()
+        job = partial(run, n=a.slices, jacobian=jacobian, sd_px=a.sd)
+        with ProcessPoolExecutor(a.workers) as pool:
+            for part in pool.map(job, range(a.first, a.first + a.sequences)):
+                total.add(part)
+        report(jacobian, a.sequences, a.slices, total)
 
 
 if __name__ == "__main__":

@@ -338,8 +338,12 @@ class Tracker:
     def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
         """Matches and all that could be said instead of the best of them."""
         matches = with_twins(self.model, scene, matches, self._symmetries, least_matches)
+        asked = matches.spot_of_rod[0]
         matches = with_other_rods(self.model, scene, matches, least_matches)
-        return doubt(self.model, scene, matches, least_matches=least_matches)
+        matches = doubt(self.model, scene, matches, least_matches=least_matches)
+        if not np.array_equal(matches.spot_of_rod[0], asked):  # the best is another now: ask the same of it
+            matches = with_other_rods(self.model, scene, matches, least_matches)
+        return matches
 
     def _decided(
         self, matches: Matches, prediction: Prediction | None, scene: Scene, spots: Spots, scale: Scale

@@ -27,24 +27,32 @@ _INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 7.5
 
 
 def with_other_rods(model: RodModel, scene: Scene, matches: Matches, least_matches: int) -> Matches:
-    """``matches`` and, for the best of them, those in which two rods that cross near a spot exchange what they have.
+    """``matches`` and, for the best of them, those in which one spot is given otherwise, where the spots lie near.
 
-    One of them has the spot, the other another one, or none.
+    Two rods that cross near a spot exchange what they have (one of them the spot, the other another one, or none); a
+    rod takes a spot that is nobody's in place of its own, or of none.
     """
     spot_of_rod = matches.spot_of_rod[0]
     crossing = project(matches.T[0], model.starts, model.directions).xy_mm
+    gap = np.linalg.norm(np.nan_to_num(crossing, nan=np.inf)[:, None] - scene.xy_mm, axis=-1)
+    rod_of_spot = np.full(len(scene.xy_mm), -1, dtype=np.intp)
     taken = np.nonzero(spot_of_rod >= 0)[0]
-    gap = np.linalg.norm(np.nan_to_num(crossing, nan=np.inf)[:, None] - scene.xy_mm[spot_of_rod[taken]], axis=-1)
-    variants: list[IntArray] = []
-    for rod, j in zip(*np.nonzero(gap < _NEAR_SIZES * model.size_mm), strict=True):
-        has_it = taken[j]
-        if rod < has_it or spot_of_rod[rod] < 0:  # each pair once
-            other = spot_of_rod.copy()
-            other[[rod, has_it]] = spot_of_rod[[has_it, rod]]
-            variants.append(other)
+    rod_of_spot[spot_of_rod[taken]] = taken
+    variants: dict[bytes, IntArray] = {}
+    for rod, spot in zip(*np.nonzero(gap < _NEAR_SIZES * model.size_mm), strict=True):
+        has_it = rod_of_spot[spot]
+        if has_it == rod:
+            continue
+        other = spot_of_rod.copy()
+        if has_it >= 0:
+            other[has_it] = spot_of_rod[rod]
+        other[rod] = spot
+        variants[other.tobytes()] = other
     if not variants:
         return matches
-    found = weigh(model, scene, np.repeat(matches.T[:1], len(variants), axis=0), np.stack(variants), least_matches)
+    found = weigh(
+        model, scene, np.repeat(matches.T[:1], len(variants), axis=0), np.stack(list(variants.values())), least_matches
+    )
     return matches if found is None else join([matches, found])
 
 

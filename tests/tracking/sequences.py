@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +27,8 @@ class TrueSlice:
     rods: list[int]
     bound: np.ndarray | None
     has_jumped: bool
+    #: the spot that each of them left
+    spots: list[int] = field(default_factory=list)
 
 
 @dataclass
@@ -54,7 +56,12 @@ def frame_of(model: RodModel) -> OracleFrame:
 
 
 def trajectory(
-    rng: np.random.Generator, kind: str, times_s: np.ndarray, middle: np.ndarray, place_mm: np.ndarray
+    rng: np.random.Generator,
+    kind: str,
+    times_s: np.ndarray,
+    middle: np.ndarray,
+    place_mm: np.ndarray,
+    period_s: float | None = None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], set[int]]:
     """(R, t) of every slice, and the slices before which the frame jumped. Motion is about the frame's middle."""
     n = len(times_s)
@@ -63,7 +70,8 @@ def trajectory(
     shift, turn = np.zeros((n, 3)), np.zeros((n, 3))
     jumps: set[int] = set()
     if kind in ("breathing", "mixed"):
-        period = rng.uniform(3, 6)
+        drawn = rng.uniform(3, 6)
+        period = period_s or drawn
         breath = np.sin(np.pi * (times_s / period + rng.uniform())) ** 4
         direction = np.array([0.1, -0.35, 0.93]) + 0.2 * rng.normal(size=3)
         shift += breath[:, None] * rng.uniform(3, 8) * direction / np.linalg.norm(direction)
@@ -97,6 +105,7 @@ def sequence(
     p_missing: float = 0.2,
     most_false: int = 3,
     interval_s: float = 0.4,
+    period_s: float | None = None,
     with_times: bool = True,
 ) -> Sequence:
     """A sequence of spots with its truth."""
@@ -107,7 +116,7 @@ def sequence(
     s = np.array([mm_per_px, mm_per_px])
     times_s = interval_s * np.arange(n)
     middle = (frame.starts.mean(axis=0) + frame.ends.mean(axis=0)) / 2
-    poses, jumps = trajectory(rng, kind, times_s, middle, np.array([*(256 * s), 0.0]))
+    poses, jumps = trajectory(rng, kind, times_s, middle, np.array([*(256 * s), 0.0]), period_s)
     slices, truth = [], []
     for i, (R, t) in enumerate(poses):
         rods, spots = [], []
@@ -122,14 +131,16 @@ def sequence(
             reach = 1.3 * np.ptp(true, axis=0).max() / 2 + 5
             clutter = true.mean(axis=0) + rng.uniform(-reach, reach, (int(rng.integers(0, most_false + 1)), 2))
             uv = np.concatenate([uv, clutter])
-        uv = uv[rng.permutation(len(uv))]
+        order = rng.permutation(len(uv))
+        uv = uv[order]
+        spot_of = np.argsort(order)[: len(rods)].tolist()
         info = SliceInfo(
             source=f"s{i}", time_s=float(times_s[i]) if with_times else None, scale=Scale(s_x=s[0], s_y=s[1])
         )
         covariance = np.tile(np.eye(2) * sd_px**2, (len(uv), 1, 1))
         slices.append(SpotSlice(info=info, spots=Spots(uv_px=uv, covariance_px=covariance)))
         C = bound(frame, rods, R, t, s, sd_px) if len(rods) >= 3 else None
-        truth.append(TrueSlice(R=R, t=t, rods=rods, bound=C, has_jumped=i in jumps))
+        truth.append(TrueSlice(R=R, t=t, rods=rods, bound=C, has_jumped=i in jumps, spots=spot_of))
     return Sequence(frame=frame, model=model or model_of(frame), slices=slices, truth=truth)
 
 
