@@ -24,6 +24,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -102,6 +103,8 @@ def is_decidable(made: Sequence, i: int, sd_px: float) -> bool:
 def _world(made: Sequence, i: int, sd_px: float) -> OracleScene:
     true, spots = made.truth[i], made.slices[i].spots
     scale = made.slices[i].info.scale
+    assert scale is not None
+    assert true.bound is not None
     rod_of_spot = np.full(len(spots), -1)
     rod_of_spot[true.spots] = true.rods
     return OracleScene(
@@ -211,7 +214,7 @@ def rises(
 # --- the experiment ---------------------------------------------------------------------------------------------------
 
 
-def run(seed: int, *, n: int, jacobian: str, sd_px: float) -> Tally:
+def run(seed: int, *, n: int, jacobian: Literal["updated", "constant"], sd_px: float) -> Tally:
     """One sequence."""
     made = sequence(seed, n=n, sd_px=sd_px)
     tally = Tally()
@@ -325,7 +328,8 @@ def main() -> None:
     if a.smooth:
         table_smooth(min(a.sequences, 40), a.sd)
         return
-    for jacobian in ("updated", "constant") if a.jacobian == "both" else (a.jacobian,):
+    strategies: tuple[Literal["updated", "constant"], ...] = ("updated", "constant")
+    for jacobian in strategies if a.jacobian == "both" else [s for s in strategies if s == a.jacobian]:
         total = Tally()
         job = partial(run, n=a.slices, jacobian=jacobian, sd_px=a.sd)
         with ProcessPoolExecutor(a.workers) as pool:

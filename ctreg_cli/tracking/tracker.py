@@ -49,6 +49,8 @@ _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
 _SYMMETRIC_WITHIN = 0.05
 #: spots or rods up to which a match of four is looked for
 _FEW = 6
+#: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
+_SAME_POSE_D2 = 1e-3
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
 
@@ -103,8 +105,13 @@ class _Past:
 
     motion: motion.MotionState
     info: SliceInfo
+    scale: Scale
     spots_px: FloatArray
     tracked: Tracked
+    #: its time, or, where it came without one, what the slices before make of it; None while none had a time
+    time_s: float | None = None
+    #: time from slice to slice, for slices that come without
+    interval_s: float = 1.0
     #: slices since, in which the frame was not found
     n_missed: int = 0
 
@@ -121,7 +128,8 @@ class Tracker:
         self.model = model
         self.options = options or TrackingOptions()
         self._past: _Past | None = None
-        self._predicted: tuple[SliceInfo, Prediction | None] | None = None
+        self._predicted: tuple[SliceInfo, Scale, Prediction | None] | None = None
+        self._series: str | None = None
         #: (n, 2, 6) Ĵ of the constant strategy, mm per mm and rad
         self._kept_jacobian: FloatArray | None = None
         self._is_lost = False
@@ -135,9 +143,9 @@ class Tracker:
 
     def predict(self, info: SliceInfo, scale: Scale) -> Prediction | None:
         """The pose and spots expected in the next slice; None while there is no past to go by."""
-        if self._predicted is None or self._predicted[0] is not info:
-            self._predicted = (info, self._predict(info, scale))
-        return self._predicted[1]
+        if self._predicted is None or self._predicted[0] is not info or self._predicted[1] != scale:
+            self._predicted = (info, scale, self._predict(info, scale))
+        return self._predicted[2]
 
     def _predict(self, info: SliceInfo, scale: Scale) -> Prediction | None:
         past, model = self._past, self.model
@@ -145,12 +153,9 @@ class Tracker:
             return None
         if (past.info.T_patient_slice is None) != (info.T_patient_slice is None):
             return None
-        n_slices = past.n_missed + 1
-        dt_s = float(n_slices)
-        if info.time_s is not None and past.info.time_s is not None:
-            dt_s = info.time_s - past.info.time_s
-            if dt_s < 0:
-                return None
+        dt_s = _time_since(past, info)
+        if dt_s is None:
+            return None
         moved = motion.advance(past.motion, dt_s, self.options.prediction)
         axes = self._axes(info)
         T = axes.slice_pose(moved.T)
@@ -172,7 +177,7 @@ class Tracker:
             radius_px=reach * (GATE_SD / min(scale.s_x, scale.s_y)),
             motion=moved,
             dt_s=dt_s,
-            n_slices=n_slices,
+            n_slices=past.n_missed + 1,
         )
 
     # --- the verdict on a slice --------------------------------------------------------------------------------------
@@ -186,9 +191,11 @@ class Tracker:
             scale: mm per pixel.
         """
         prediction = self.predict(info, scale)
+        if self._series != info.series:  # another sequence: nothing was lost in it yet
+            self._series, self._is_lost = info.series, False
         if prediction is None:
             self._past = None
-        elif (again := self._repeated(spots, prediction, info)) is not None:
+        elif (again := self._repeated(spots, info, scale)) is not None:
             return again
         scene = self._scene(spots, info, scale)
         why = ""
@@ -204,7 +211,9 @@ class Tracker:
             if sure is not None and sure.status != "ok":
                 return self._lost(sure, prediction, scene)
             if sure is not None:
-                return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info)
+                return self._remember(
+                    sure, self.options.jacobian, followed.servo.margin, prediction, spots, info, scale
+                )
         return self._registered(prediction, scene, spots, info, scale, followed, why)
 
     def follow(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
@@ -222,7 +231,7 @@ class Tracker:
         sure = self._verified(prediction, scene, spots, scale, followed)
         if sure is None:
             return None
-        return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info)
+        return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info, scale)
 
     def miss(self) -> None:
         """A slice that could not be read: time passes."""
@@ -244,17 +253,12 @@ class Tracker:
             options=self.options.registration,
         )
 
-    def _repeated(self, spots: Spots, prediction: Prediction, info: SliceInfo) -> Tracked | None:
+    def _repeated(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
         """The verdict on the last slice, if this one is the same again (to the last digit): it tells nothing new."""
         past = self._past
-        if past is None or past.n_missed or not np.array_equal(spots.uv_px, past.spots_px):
+        if past is None or not _same_place(past, info, scale) or not np.array_equal(spots.uv_px, past.spots_px):
             return None
-        if past.info.scale != info.scale or past.info.thickness_mm != info.thickness_mm:
-            return None
-        here, there = past.info.T_patient_slice, info.T_patient_slice
-        if here is not None and there is not None and not np.array_equal(here, there):
-            return None
-        return past.tracked
+        return replace(past.tracked, begins=False)
 
     # --- 1. servo ----------------------------------------------------------------------------------------------------
 
@@ -401,7 +405,7 @@ class Tracker:
             verdict = replace(verdict, warnings=(*verdict.warnings, ("registered_anew", why)))
         if self._past is not None and not follows_on:
             self._is_lost = True
-        return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info)
+        return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info, scale)
 
     def _lost(self, verdict: Registration, prediction: Prediction | None, scene: Scene) -> Tracked:
         """No sure pose: say so; the past stays only if nothing speaks against it."""
@@ -427,15 +431,28 @@ class Tracker:
         prediction: Prediction | None,
         spots: Spots,
         info: SliceInfo,
+        scale: Scale,
     ) -> Tracked:
         """Take a sure pose into the motion; ``prediction`` is None where a new motion begins."""
-        best, model = sure.candidates[0], self.model
+        best, model, past = sure.candidates[0], self.model, self._past
+        if past is not None and prediction is not None and prediction.dt_s == 0 and _same_place(past, info, scale):
+            apart = difference(best.T_slice_model, past.tracked.registration.candidates[0].T_slice_model)
+            if float(apart @ np.linalg.solve(best.covariance, apart)) < _SAME_POSE_D2:
+                # the same slice again, its spots perhaps in another order, tells nothing new
+                return replace(past.tracked, registration=sure, begins=False)
         axes = self._axes(info)
         T, G = axes.pose(best.T_slice_model), axes.twist(best.T_slice_model)
         C = G @ best.covariance @ G.T
         kind = self.options.prediction
-        if prediction is None:
-            learnt = None if self._past is None else self._past.motion.intensity
+        time_s, interval_s = info.time_s, 1.0
+        if past is not None and prediction is not None:
+            if prediction.dt_s > 0:
+                interval_s = prediction.dt_s / prediction.n_slices
+            if time_s is None and past.time_s is not None:
+                time_s = past.time_s + prediction.dt_s
+        timed = past is not None and (past.time_s is None) == (time_s is None)
+        if prediction is None or not timed:
+            learnt = past.motion.intensity if past is not None and timed else None
             state = motion.start(T, C, kind, learnt)
         else:
             innovation = difference(T, prediction.motion.T)
@@ -450,7 +467,15 @@ class Tracker:
             begins=prediction is None,
         )
         self._is_lost = False
-        self._past = _Past(motion=state, info=info, spots_px=spots.uv_px, tracked=tracked)
+        self._past = _Past(
+            motion=state,
+            info=info,
+            scale=scale,
+            spots_px=spots.uv_px,
+            tracked=tracked,
+            time_s=time_s,
+            interval_s=interval_s,
+        )
         return tracked
 
     def _velocity(self, state: motion.MotionState, T_slice_model: FloatArray, info: SliceInfo) -> Velocity | None:
@@ -469,6 +494,24 @@ class _Followed:
     spot_of_rod: IntArray
     servo: ServoResult
     outlook: Outlook
+
+
+def _time_since(past: _Past, info: SliceInfo) -> float | None:
+    """Seconds from the last sure slice to this one, as far as slices say; None where time runs backwards."""
+    if info.time_s is None or past.time_s is None:
+        return (past.n_missed + 1) * past.interval_s
+    dt_s = info.time_s - past.time_s
+    if dt_s < 0:
+        return None if past.info.time_s is not None else 0.0  # a reckoned time may be a little late
+    return dt_s
+
+
+def _same_place(past: _Past, info: SliceInfo, scale: Scale) -> bool:
+    """Whether a slice is one of the same place, scale and thickness as the last sure one, with none between."""
+    if past.n_missed or past.scale != scale or past.info.thickness_mm != info.thickness_mm:
+        return False
+    here, there = past.info.T_patient_slice, info.T_patient_slice
+    return here is None or there is None or np.array_equal(here, there)
 
 
 def continues(candidate: Candidate, prediction: Prediction) -> bool:

@@ -14,6 +14,8 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.options import TrackingOptions
+from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.tracker import Tracker
 from tests.oracle import OracleFrame, random_frame
 from tests.tracking.sequences import Sequence, error_of, frame_of, is_wrong, model_of, sequence
 
@@ -141,6 +143,95 @@ def test_gaps_in_time_and_no_times_at_all() -> None:
     results = track(timeless)
     assert not wrong(results, timeless)
     assert all(r.status == "ok" and r.velocity is None for r in results)
+
+
+def test_slices_without_a_time_among_others_that_have_one() -> None:
+    """The time is reckoned on: neither the pose nor the velocity after it suffers."""
+    made = clean("drift", n=24, seed=12)
+    for i in (9, 10, 17):
+        made.slices[i] = replace(made.slices[i], info=replace(made.slices[i].info, time_s=None))
+    results = track(made)
+    assert not wrong(results, made)
+    assert [r.status for r in results] == ["ok"] * 24
+    assert [r.method for r in results[1:]].count("updated") >= 22
+    assert all(results[i].velocity is None for i in (9, 10, 17))
+    for i in (11, 12, 18, 19):
+        true = error_of(_pose(made.truth[i + 1]), made.truth[i - 1]) / 0.8
+        velocity = results[i].velocity
+        assert velocity is not None
+        d = velocity.twist - true
+        assert d @ np.linalg.solve(velocity.covariance, d) < 25.0
+
+
+def test_times_that_begin_late_start_the_velocity_only_then() -> None:
+    made = clean("drift", n=10, seed=12)
+    for i in range(5):
+        made.slices[i] = replace(made.slices[i], info=replace(made.slices[i].info, time_s=None))
+    results = track(made)
+    assert [r.status for r in results] == ["ok"] * 10
+    assert all(r.velocity is None for r in results[:6])
+    assert all(r.velocity is not None for r in results[6:])
+    assert [r.begins for r in results] == [True] + [False] * 9
+
+
+def test_the_same_slice_at_another_scale_is_another_slice() -> None:
+    made = clean(n=4)
+    tracker = Tracker(made.model)
+    scale, larger = Scale(s_x=0.5, s_y=0.5), Scale(s_x=0.75, s_y=0.75)
+    for item in made.slices:
+        last = tracker.step(item.spots, item.info, scale)
+    assert last.registration.status == "ok"
+    prediction = tracker.predict(item.info, larger)
+    assert prediction is not None
+    at_scale = tracker.predict(item.info, scale)
+    assert at_scale is not None
+    np.testing.assert_allclose(prediction.spots_px * 1.5, at_scale.spots_px)
+    again = tracker.step(item.spots, item.info, larger)
+    assert again.registration.status != "ok"  # no pose of this frame makes these spots so far apart
+    assert tracker.step(item.spots, item.info, scale).registration.status == "ok"
+
+
+def test_a_slice_read_twice_from_windows_moves_nothing() -> None:
+    made = clean(n=10)
+    tracker = Tracker(made.model)
+    item, scale = made.slices[-1], Scale(s_x=0.5, s_y=0.5)
+    for before in made.slices[:-1]:
+        tracker.step(before.spots, before.info, scale)
+    once = tracker.follow(item.spots, item.info, scale)
+    turned = item.spots.take(np.arange(len(item.spots))[::-1])
+    again_info = replace(item.info, source="copy")
+    twice = tracker.follow(turned, again_info, scale)
+    assert once is not None
+    assert twice is not None
+    assert once.velocity is not None
+    assert twice.velocity is once.velocity
+    (a,), (b,) = once.registration.candidates, twice.registration.candidates
+    np.testing.assert_allclose(a.T_slice_model, b.T_slice_model, atol=1e-4)
+    np.testing.assert_array_equal(item.spots.uv_px[a.spot_index], turned.uv_px[b.spot_index])
+
+
+def test_a_series_after_one_that_ended_lost_is_registered_and_not_reacquired() -> None:
+    first, second = clean(n=6, seed=5), clean(n=4, seed=6)
+    first.slices[-1] = replace(first.slices[-1], spots=first.slices[-1].spots.take(np.arange(2)))
+    relabelled = [replace(item, info=replace(item.info, series="other")) for item in second.slices]
+    results = list(pipeline.track([*first.slices, *relabelled], CUBE))
+    assert results[5].status == "no_pose"
+    assert results[6].method == "registered"
+    assert results[6].begins
+
+
+def test_two_frames_in_view_are_not_taken_for_one_another() -> None:
+    """A second frame of the same kind beside the first: alone not to be told apart, followed it is."""
+    made = clean(n=12, seed=5)
+    for i in range(4, 12):
+        beside = made.slices[i].spots.uv_px + np.array([110.0, 20.0])
+        uv = np.concatenate([made.slices[i].spots.uv_px, beside])
+        made.slices[i] = replace(made.slices[i], spots=Spots.from_points(uv, 0.05))
+    results = track(made)
+    assert not wrong(results, made)
+    assert sum(r.status == "ok" for r in results) == 12
+    cold = Sequence(made.frame, made.model, made.slices[4:], made.truth[4:])
+    assert {r.status for r in track(cold)} == {"ambiguous"}
 
 
 def test_a_new_series_starts_anew() -> None:
