@@ -15,10 +15,11 @@ Names are loaded when first used: ``import ctreg_cli`` costs nothing.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 from ctreg_cli._version import __version__
 
+#: as in :mod:`typing`, which takes longer to load than all of this
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ctreg_cli.errors import (
         CalibrationError,

@@ -12,9 +12,10 @@ from typer.core import TyperGroup
 
 from ctreg_cli._version import __version__
 from ctreg_cli.cli import calibrate, console, export, info, listen, model, pose, report, segment, servo, simulate, track
+from ctreg_cli.cli.interrupt import EXIT_INTERRUPTED, interruptible
 from ctreg_cli.errors import CtregError, EstimationError
 
-EXIT_NOTHING_FOUND, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_NOTHING_FOUND, EXIT_BAD_INPUT = 1, 2
 
 
 class CtregGroup(TyperGroup):
@@ -25,7 +26,8 @@ class CtregGroup(TyperGroup):
             # data is UTF-8 wherever it goes, also where the console is not
             sys.stdout.reconfigure(encoding="utf-8")
         try:
-            return super().invoke(ctx)
+            with interruptible():
+                return super().invoke(ctx)
         except EstimationError as error:
             console.error(str(error))
             raise typer.Exit(EXIT_NOTHING_FOUND) from error

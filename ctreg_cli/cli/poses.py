@@ -12,6 +12,7 @@ from ctreg_cli.cli.overlays import OverlayWriter
 from ctreg_cli.cli.run import Watched, choose_scale, close, consume, open_inputs
 from ctreg_cli.cli.summary import PoseTally
 from ctreg_cli.cli.watch_session import Session
+from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.interop.exports import ExportSink, split_outputs
 from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding, write_results
@@ -64,7 +65,8 @@ def run_poses(
         session: where slices come from and results go beside files, if anywhere.
 
     Raises:
-        CtregError: the model, the input, the scale or an output cannot be used.
+        CtregError: the model, the input, the scale or an output cannot be used; live, a failed output is the last
+            word, after the slices have been worked on all the same.
         typer.Exit: code 1 when not one slice gave a pose, or with ``strict`` when any slice is not ``ok``.
     """
     session = session or Session()
@@ -90,15 +92,18 @@ def run_poses(
     )
     more = [ExportSink(output, header, one_slice=len(source) == 1, tell=talk.warn) for output in exports]
     encoding = results_encoding(header, with_uids=arguments.with_uids)
-    sinks = open_sinks(outputs, encoding, sys.stdout) if outputs else Sinks[FrameResult]([])
-    for sink in more:
-        sinks.add(sink)
+    sinks = open_sinks(outputs, encoding, sys.stdout) if outputs else Sinks[FrameResult]()
+    for output, export in zip(exports, more, strict=True):
+        sinks.add(output, export)
     for live in session.sinks:
-        sinks.add(live, first=True)
+        sinks.add("OpenIGTLink", live, first=True)
+    if session.is_live:
+        sinks.outlive_failures(talk.warn)
     kept: list[FrameResult] = []
     watched, tally = Watched(source, talk), PoseTally(scale=scale.scale, scale_from=scale.origin)
 
     def on_result(result: FrameResult) -> None:
+        nonlocal overlays
         doubt = scale.doubt(result.info)
         if doubt and not tally.n_doubtful:
             talk.warn(doubt)
@@ -108,7 +113,11 @@ def run_poses(
             kept.append(result)
         slice_ = watched.answered()
         if overlays and slice_:
-            overlays.draw_result(slice_, result)
+            try:
+                overlays.draw_result(slice_, result)
+            except InputError as error:
+                sinks.lose(str(error), error)
+                overlays = None
         if talk.verbose:
             _explain(result, talk)
 
@@ -121,6 +130,8 @@ def run_poses(
     if smooth is not None:
         write_results(smoothed(kept, model, scale=scale.scale), smooth, header, with_uids=arguments.with_uids)
     talk.table([*tally.rows(), *session.rows()])
+    if sinks.lost:
+        raise InputError(f"{sinks.lost[0]}; slices from there on are not in it")
     close(n_good=tally.n_poses, n_failed=tally.total - tally.n_ok, strict=arguments.strict)
 
 

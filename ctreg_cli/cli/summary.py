@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -22,6 +23,11 @@ SCALE_SOURCES = {
 }
 
 
+def _numbers() -> array[float]:
+    """Eight bytes a number: a session may last for days."""
+    return array("d")
+
+
 @dataclass(slots=True)
 class PoseTally:
     """Outcomes of a run; a few numbers a slice, whatever its pixels."""
@@ -32,9 +38,9 @@ class PoseTally:
     scales: set[Scale] = field(default_factory=set)
     outcomes: Counter[str] = field(default_factory=Counter)
     warnings: Counter[str] = field(default_factory=Counter)
-    rms_px: list[float] = field(default_factory=list)
-    sd_mm: list[float] = field(default_factory=list)
-    sd_deg: list[float] = field(default_factory=list)
+    rms_px: array[float] = field(default_factory=_numbers)
+    sd_mm: array[float] = field(default_factory=_numbers)
+    sd_deg: array[float] = field(default_factory=_numbers)
     total: int = 0
     n_ok: int = 0
     n_poses: int = 0

@@ -62,6 +62,11 @@ class Session:
     #: lines for the closing table
     remarks: Sequence[Callable[[], list[tuple[str, str]]]] = field(default=())
 
+    @property
+    def is_live(self) -> bool:
+        """Whether slices come as they are made: then no full disk keeps the poses from a robot."""
+        return self.source is not None
+
     def rows(self) -> list[tuple[str, str]]:
         """Names and values for the closing table."""
         return [row for remark in self.remarks for row in remark()]

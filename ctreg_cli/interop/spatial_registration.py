@@ -49,8 +49,8 @@ def spatial_registration(content: Content, record: SliceRecord, *, now: datetime
     missing = [name for name in _NEEDED if not _UID.fullmatch(record.uids.get(name, ""))]
     if missing:
         raise InputError(
-            f"{content.document.name}: slice {record.index} has no valid {missing[0]} UID, which a DICOM registration refers "
-            "to; write the results from DICOM slices with --with-uids -o results.json"
+            f"{content.document.name}: slice {record.index} has no valid {missing[0]} UID, which a DICOM registration "
+            "refers to; write the results from DICOM slices with --with-uids -o results.json"
         )
     if content.space != "patient":
         raise InputError(f"{content.document.name}: a DICOM registration is in patient coordinates")

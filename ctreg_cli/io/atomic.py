@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import TextIO
@@ -48,7 +49,8 @@ class AtomicFile:
 
     def abandon(self) -> None:
         """Leave no trace. Does nothing after :meth:`commit`."""
-        self.stream.close()
+        with contextlib.suppress(OSError):  # what the disk had no room for is not wanted any more
+            self.stream.close()
         if not self._direct:
             self._partial.unlink(missing_ok=True)
 

@@ -173,20 +173,35 @@ class JsonLinesFile(Generic[Item]):
         check_folder(path)
         self._path, self._is_new = path, not path.exists()
         try:
-            # not "w": an earlier file stays until there is something to put in its place
-            self._stream = path.open("a", encoding="utf-8", newline="")
+            # not "w": an earlier file stays until there is something to put in its place; not buffered: what could not
+            # be written shall not be tried again by closing
+            self._stream = path.open("ab", buffering=0)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+        self._is_file = path.is_file()
         self._started = False
+        #: bytes of whole lines
+        self._whole = 0
 
     def _line(self, value: object) -> None:
-        self._stream.write(_json(value) + "\n")
-        self._stream.flush()
+        data = f"{_json(value)}\n".encode()
+        left = memoryview(data)
+        try:
+            while left:
+                left = left[self._stream.write(left) :]
+        except OSError:  # the disk is full: the part of a line that went in goes out again
+            self._cut(self._whole)
+            raise
+        self._whole += len(data)
+
+    def _cut(self, length: int) -> None:
+        """Leave so many bytes of a file; of a pipe or a device nothing can be taken back."""
+        if self._is_file:
+            self._stream.truncate(length)
 
     def _start(self, item: Item | None) -> None:
         if not self._started:
-            if self._stream.seekable():
-                self._stream.truncate(0)
+            self._cut(0)
             self._line(self._encoding.header(item))
             self._started = True
 
@@ -257,26 +272,56 @@ class Sinks(Generic[Item]):
 
     A reader of standard output who leaves early (``| head``) takes only that output away; :attr:`alive` says whether
     anyone is still listening.
+
+    Args:
+        sinks: outputs, by the name they have in messages.
     """
 
-    def __init__(self, sinks: Sequence[Sink[Item]]) -> None:
+    def __init__(self, sinks: Sequence[tuple[str, Sink[Item]]] = ()) -> None:
         self._sinks = list(sinks)
+        self._tell: Callable[[str], None] | None = None
+        #: what was said of outputs that failed while the others went on
+        self.lost: list[str] = []
 
     @property
     def alive(self) -> bool:
         return bool(self._sinks)
 
-    def add(self, sink: Sink[Item], *, first: bool = False) -> None:
+    def add(self, name: str, sink: Sink[Item], *, first: bool = False) -> None:
         """One more output, written before all others where it cannot wait."""
-        self._sinks.insert(0 if first else len(self._sinks), sink)
+        self._sinks.insert(0 if first else len(self._sinks), (name, sink))
+
+    def outlive_failures(self, tell: Callable[[str], None]) -> None:
+        """From now on an output that cannot be written (a full disk) is left behind, and told; the others go on."""
+        self._tell = tell
 
     def write(self, item: Item) -> None:
+        """Give an item to every output.
+
+        Raises:
+            InputError: an output cannot be written, and the others shall not do without it.
+        """
         with _uninterrupted():
-            for sink in tuple(self._sinks):
+            for name, sink in tuple(self._sinks):
                 try:
                     sink.write(item)
                 except BrokenPipeError:
-                    self._sinks.remove(sink)
+                    self._sinks.remove((name, sink))
+                except OSError as error:
+                    self.lose(_unwritable(name, error), error)
+                    self._sinks.remove((name, sink))
+                    sink.abandon()
+
+    def lose(self, text: str, error: Exception) -> None:
+        """Go on without an output that failed, if that is wanted.
+
+        Raises:
+            InputError: it is not.
+        """
+        if self._tell is None:
+            raise InputError(text) from error
+        self.lost.append(text)
+        self._tell(text)
 
     def __enter__(self) -> Self:
         return self
@@ -287,18 +332,28 @@ class Sinks(Generic[Item]):
         finish = kind is None or issubclass(kind, KeyboardInterrupt)
         with _uninterrupted():
             while self._sinks:
-                sink = self._sinks.pop(0)
+                name, sink = self._sinks.pop(0)
                 try:
-                    if finish:
-                        sink.finish()
-                    else:
-                        sink.abandon()
-                except BrokenPipeError:
-                    continue
+                    self._end(name, sink, finish)
                 except Exception:
-                    for other in self._sinks:
+                    for _, other in self._sinks:
                         other.abandon()
                     raise
+
+    def _end(self, name: str, sink: Sink[Item], finish: bool) -> None:
+        try:
+            if finish:
+                sink.finish()
+            else:
+                sink.abandon()
+        except BrokenPipeError:
+            return
+        except (OSError, InputError) as error:
+            self.lose(_unwritable(name, error), error)
+
+
+def _unwritable(name: str, error: OSError | InputError) -> str:
+    return str(error) if isinstance(error, InputError) else f"{name}: cannot be written ({error.strerror or error})"
 
 
 def format_of(output: str) -> str:
@@ -339,12 +394,13 @@ def open_sinks(outputs: Sequence[str], encoding: Encoding[Item], standard_output
     Raises:
         InputError: as :func:`check_outputs`, or a place that cannot be written; then nothing is left.
     """
-    sinks: list[Sink[Item]] = []
+    sinks: list[tuple[str, Sink[Item]]] = []
     try:
         for output in check_outputs(outputs):
-            sinks.append(_open(output, format_of(output), encoding, standard_output))
+            name = "standard output" if output == STANDARD_OUTPUT else output
+            sinks.append((name, _open(output, format_of(output), encoding, standard_output)))
     except InputError:
-        for sink in sinks:
+        for _, sink in sinks:
             sink.abandon()
         raise
     return Sinks(sinks)

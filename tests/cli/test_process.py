@@ -76,3 +76,40 @@ def test_an_interrupt_writes_what_is_finished(many_spots: Path, tmp_path: Path) 
     assert 3 <= len(rows) == len(records) == len(lines.read_text(encoding="utf-8").splitlines()) - 1 < N_MANY
     assert [row.index for row in rows] == list(range(len(rows)))
     assert sorted(tmp_path.iterdir()) == sorted([table, document, lines])
+
+
+@pytest.mark.parametrize("loading", ["typer", "ctreg_cli.cli.segment"])
+def test_an_interrupt_while_loading_is_silent(loading: str) -> None:
+    script = f"""
+import os, signal, sys
+class Finger:
+    def find_spec(self, name, path=None, target=None):
+        if name == {loading!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finger())
+from ctreg_cli.__main__ import main
+sys.argv = ["ctreg", "--version"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize(("outputs", "place"), [([], "standard output"), (["-o", "full.jsonl"], "full.jsonl")])
+def test_a_full_disk_is_named(two_slices: Path, tmp_path: Path, outputs: list[str], place: str) -> None:
+    (tmp_path / "full.jsonl").symlink_to(FULL)
+    with FULL.open("w") as full:
+        done = subprocess.run(
+            [*CTREG, "pose", two_slices, "-m", FRAME, *outputs, "-q"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+            timeout=PATIENCE_S,
+        )
+    assert done.returncode == 2
+    assert done.stderr == f"ctreg: error: {place}: cannot be written (No space left on device)\n"

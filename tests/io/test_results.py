@@ -6,7 +6,9 @@ import csv
 import io
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -314,3 +316,66 @@ def test_what_is_no_pose_table_is_said(tmp_path: Path) -> None:
         stream.write("0,s,,ok,,registered,5,5,0.1,one,2,3,0,0,0,1\n")
     with pytest.raises(InputError, match=r"p\.csv:2: .*tx_mm"):
         read_results(tmp_path / "p.csv")
+
+
+class FullDisk:
+    """An output that takes two items."""
+
+    def __init__(self) -> None:
+        self.taken, self.abandoned = 0, False
+
+    def write(self, _item: object) -> None:
+        if self.taken == 2:
+            raise OSError(28, "No space left on device")
+        self.taken += 1
+
+    def finish(self) -> None:
+        raise AssertionError("it has been left behind")
+
+    def abandon(self) -> None:
+        self.abandoned = True
+
+
+def test_a_full_disk_ends_a_run_and_not_a_live_session(tmp_path: Path, results: list[FrameResult]) -> None:
+    for live in (False, True):
+        full, told = FullDisk(), list[str]()
+        path = tmp_path / f"{live}.csv"
+        sinks = open_sinks([str(path)], results_encoding(HEADER), io.StringIO())
+        sinks.add("full.mat", full)
+        if live:
+            sinks.outlive_failures(told.append)
+        with nullcontext() if live else pytest.raises(InputError, match=r"full\.mat: cannot be written"), sinks:
+            for result in results:
+                sinks.write(result)
+        assert full.abandoned
+        assert path.exists() == live
+        assert told == sinks.lost == ["full.mat: cannot be written (No space left on device)"] * live
+    assert len(read_results(tmp_path / "True.csv")) == len(results)
+
+
+def test_a_line_the_disk_has_no_room_for_is_taken_back(
+    tmp_path: Path, results: list[FrameResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file ends with a whole line, whatever the disk took of the next."""
+    path = tmp_path / "p.jsonl"
+    real = Path.open
+
+    class Nearly(io.FileIO):
+        room = 9000
+
+        def write(self, data: Any, /) -> int:
+            if not self.room:
+                raise OSError(28, "No space left on device")
+            n = super().write(bytes(data)[: self.room])
+            self.room -= n
+            return n
+
+    def open_(self: Path, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+        return Nearly(self, mode) if mode == "ab" else real(self, mode, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", open_)
+    with pytest.raises(InputError, match="No space left"):
+        write_results(results * 5, path, HEADER)
+    text = path.read_text(encoding="utf-8")
+    assert text.endswith("}\n")
+    assert 2 <= len([json.loads(line) for line in text.splitlines()]) <= len(results) * 5
