@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.imaging.profile import CENTRE, GRADIENT, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
 
-#: steps at most. A spot is done when its centre moves by less than this (px), or the step by less than this (sd²):
-#: the next would be several times smaller
-MAX_STEPS, DONE_PX, DONE_SD2 = 10, 1e-3, 1e-3
+#: steps at most, and so many of them for all spots together. A spot is done when its centre moves by less than this
+#: (px), or the step by less than this (sd²): the next would be several times smaller
+MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
 #: range of ln β: from tails heavier than a Gaussian's to nearly a box
 LOG_BETA_RANGE = (-0.5, 1.5)
-#: Levenberg–Marquardt damping
-FIRST_DAMPING, DAMPING_FACTOR = 1e-4, 10.0
+#: Levenberg–Marquardt damping; a step that is small only because of much damping does not end the fit
+FIRST_DAMPING, DAMPING_FACTOR, DONE_DAMPING = 1e-4, 10.0, 1e-2
 
 
 def _per_parameter(*, centre: float, log_height: float, background: float, shape: float, log_beta: float) -> FloatArray:
@@ -34,9 +34,22 @@ MAX_CHANGE = _per_parameter(centre=2.0, log_height=2.0, background=np.inf, shape
 def fit(rows: Rows, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Parameters (10, k) and normal matrices (k, 10, 10) at the minima of Σ w r² plus weak priors on the shape.
 
-    Every spot has its own damping and stops on its own, so that its centre does not depend on who is fitted beside it.
-    Afterwards ``rows`` holds derivatives and residuals there.
+    Every spot has its own damping and stops on its own, so that its centre does not depend on who is fitted beside it;
+    the few that need many steps take them by themselves. Afterwards ``rows`` holds derivatives and residuals there.
     """
+    parameters, normal, done = _steps(rows, start, start, STEPS_TOGETHER)
+    if not done.all():
+        few = np.flatnonzero(~done)
+        slow = rows.take(few)
+        parameters[:, few], normal[few], _ = _steps(slow, start[:, few], parameters[:, few], MAX_STEPS - STEPS_TOGETHER)
+        rows.by_spot[few] = slow.by_spot
+    return parameters, normal
+
+
+def _steps(
+    rows: Rows, start: FloatArray, parameters: FloatArray, most: int
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Parameters, normal matrices, and which spots (k,) are done, after at most so many steps from ``parameters``."""
     low: FloatArray = start - MAX_CHANGE
     high: FloatArray = start + MAX_CHANGE
     low[LOG_BETA], high[LOG_BETA] = LOG_BETA_RANGE
@@ -44,29 +57,29 @@ def fit(rows: Rows, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     unit[7] = np.exp(-start[6])  # a step in l1 is measured in the spot's own coordinates, as all others are
     diagonal = np.arange(N_PARAMETERS)
 
-    parameters, deviation = start, np.zeros_like(start)
-    products = rows.evaluate(start)
-    cost = products[:, -1, -1]
-    damping, done = np.full(start.shape[1], FIRST_DAMPING), np.zeros(start.shape[1], dtype=bool)
-    stale = False
-    for _ in range(MAX_STEPS):
+    deviation = (parameters - start) * unit
+    products = rows.evaluate(parameters)
+    cost = products[:, -1, -1] + (PRIOR * deviation * deviation).sum(axis=0)
+    k = start.shape[1]
+    damping, done, stale = np.full(k, FIRST_DAMPING), np.zeros(k, dtype=bool), False
+    for _ in range(most):
         damped = products[:, :-1, :-1].copy()
         damped[:, diagonal, diagonal] += PRIOR.T
         damped[:, diagonal, diagonal] *= (1.0 + damping)[:, None]
         gradient = products[:, :-1, -1] - (PRIOR * deviation).T
-        step: FloatArray = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T
+        step = np.asarray(np.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T, dtype=np.float64)
         step[:, done] = 0.0
         trial: FloatArray = np.clip(moved(parameters, step), low, high)
         small = np.abs(trial[:2] - parameters[:2]).max(axis=0) < DONE_PX
         small |= (gradient.T * step).sum(axis=0) < DONE_SD2
-        small &= damping <= FIRST_DAMPING
+        small &= damping <= DONE_DAMPING
         if small.all() and not stale:
-            parameters = trial
+            parameters, done = trial, small
             rows.by_spot[:, -1] -= (step.T[:, None] @ rows.by_spot[:, :-1])[:, 0]
             break
         trial_products = rows.evaluate(trial)
         trial_deviation = (trial - start) * unit
-        trial_cost = trial_products[:, -1, -1] + (PRIOR * trial_deviation**2).sum(axis=0)
+        trial_cost = trial_products[:, -1, -1] + (PRIOR * trial_deviation * trial_deviation).sum(axis=0)
         better = trial_cost <= cost
         done |= better & small
         stale = not better.all()
@@ -82,4 +95,4 @@ def fit(rows: Rows, start: FloatArray) -> tuple[FloatArray, FloatArray]:
         products = rows.evaluate(parameters)
     normal = products[:, :-1, :-1].copy()
     normal[:, diagonal, diagonal] += PRIOR[:, 0]
-    return parameters, normal
+    return parameters, normal, done

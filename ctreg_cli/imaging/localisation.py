@@ -17,16 +17,15 @@ from ctreg_cli.imaging.fit import fit
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, in_pixels
 from ctreg_cli.imaging.uncertainty import (
     KEPT,
-    background_structure,
     centre_covariance,
     noise_field,
     odd_variance,
-    rough_noise,
+    ring_spread,
 )
 from ctreg_cli.imaging.window import dilated, disc, grid
 
-#: background structure is correlated over about 3 × 3 px: nine pixels count as one, so its sd counts three times
-STRUCTURE_WEIGHT = 3.0
+#: background structure is correlated over a few pixels, which count as one: so its sd counts twice
+STRUCTURE_WEIGHT = 2.0
 #: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
 NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
 #: another blob that begins within this of the edge touches the spot: it is left out of the fit, not of the covariance
@@ -41,6 +40,8 @@ MODEL_SD_PX = 0.005
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
 START_LOG_BETA = 0.15
+#: height over which a centre to start from is taken, in spot heights: background and its gradient do not reach there
+START_LEVEL = 0.3
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
 MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
 
@@ -82,24 +83,26 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
         usable &= ~foreign
     clipped, n_clipped = _clipped(values, blobs.own.reshape(k, -1)[:, at], ceiling)
 
-    rough = rough_noise(blobs, usable & (distance > NOISE_BEYOND_PX))
+    noise, structure = ring_spread(blobs)
     reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
-    spread = (STRUCTURE_WEIGHT * background_structure(blobs, rough) / reach)[:, None] * distance
+    spread = (STRUCTURE_WEIGHT * structure / reach)[:, None] * distance
     spread *= spread
-    spread += (rough * rough)[:, None]
+    spread += (noise * noise)[:, None]
     root_weights = np.sqrt(np.where(usable, 1.0, LEFT_OUT) / spread)
 
     rows = Rows(u, v, values, clipped, root_weights)
-    parameters, normal = fit(rows, _start(blobs, n_clipped))
+    parameters, normal = fit(
+        rows, _start(blobs, n_clipped, _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v))
+    )
 
     shift = np.linalg.solve(normal, np.broadcast_to(np.eye(N_PARAMETERS, 2), (k, N_PARAMETERS, 2)))
     influence = (shift.transpose(0, 2, 1) @ rows.by_spot[:, :-1] * root_weights[:, None]).transpose(1, 0, 2)
     centre = parameters[CENTRE]
     residuals = rows.by_spot[:, -1] / root_weights
-    smooth = noise_field(residuals, usable & (distance > NOISE_BEYOND_PX), blobs.radius)
+    rough, smooth, length = noise_field(residuals, usable & (distance > NOISE_BEYOND_PX), blobs.radius)
     structure = odd_variance(residuals, near, centre, blobs.radius, rough) / KEPT
     covariance = centre_covariance(
-        in_pixels(parameters, influence), blobs.radius, smooth=smooth, rough=rough, structure=structure
+        in_pixels(parameters, influence), blobs.radius, smooth=(smooth, length), rough=rough, structure=structure
     )
     covariance += MODEL_SD_PX**2 * np.eye(2)
     uv = centre.T
@@ -145,8 +148,18 @@ def _inverse(symmetric: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]
     return vv / determinant, -uv / determinant, uu / determinant
 
 
-def _start(blobs: Blobs, n_clipped: IntArray) -> FloatArray:
-    """First parameters (10, k) from the blob's moments and the number (k,) of its pixels that are cut off.
+def _brightest(blobs: Blobs, values: FloatArray, about: BoolArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Centre of gravity (2, k) of what stands out of the background, taken high enough that it does not count."""
+    weights = values - (blobs.background + START_LEVEL * blobs.height)[:, None]
+    np.maximum(weights, 0.0, out=weights)
+    weights *= about
+    sums: FloatArray = np.stack([u, v, np.ones(len(u))]) @ weights.T
+    centre: FloatArray = sums[:2] / sums[2]
+    return centre
+
+
+def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray) -> FloatArray:
+    """First parameters (10, k) from the blob's moments, the number (k,) of its pixels cut off, and its ``centre``.
 
     Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the
     flat part covers ``log2 a / (1 + log2 a)`` of what lies above h/2.
@@ -158,7 +171,7 @@ def _start(blobs: Blobs, n_clipped: IntArray) -> FloatArray:
     l_vv = np.sqrt(vv * wider)
     l_uv = uv * wider / l_vv
     start = np.zeros((N_PARAMETERS, len(blobs)))
-    start[CENTRE] = blobs.centre.T
+    start[CENTRE] = centre
     start[LOG_HEIGHT] = log2_over * np.log(2.0) + np.log(blobs.height)
     start[BACKGROUND] = blobs.background
     start[SHAPE] = 0.5 * np.log(uu * wider - l_uv * l_uv), l_uv, np.log(l_vv)

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 
 #: order of the parameters: centre u, v; ln a; b; g_u, g_v; L = [[e^l0, 0], [l1, e^l2]]; ln β
 CENTRE: Final = slice(0, 2)
@@ -65,12 +65,17 @@ class Rows:
 
         The last three are (k, p); ``clipped`` is None where nothing is.
         """
-        self._u, self._v, self._clipped, self.root_weights = u, v, clipped, root_weights
+        self._u, self._v, self._values, self._clipped, self.root_weights = u, v, values, clipped, root_weights
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
         self._rows[3], self._rows[4], self._rows[5] = root_weights, root_weights * u, root_weights * v
         #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
         self.by_spot = self._rows.transpose(1, 0, 2)
+
+    def take(self, which: IntArray) -> Rows:
+        """Some of the spots."""
+        clipped = None if self._clipped is None else self._clipped[which]
+        return Rows(self._u, self._v, self._values[which], clipped, self.root_weights[which])
 
     def evaluate(self, parameters: FloatArray) -> FloatArray:
         """Fill :attr:`by_spot` for ``parameters`` (10, k); products of its rows (k, 11, 11), summed over the pixels.

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray, frozen
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.imaging.blob import Blobs
 from ctreg_cli.imaging.window import disc, grid, nan_quantile, ring
 
@@ -23,6 +23,10 @@ KEPT = 0.65
 MAD_TO_SD = 1.4826
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
+#: what the ring holds counts as structure only beyond so many times the variance that its noise may seem to have
+RING_NOISE = 1.3
+#: noise is looked at in at most so many pixels of a window
+NOISE_SAMPLES = 256
 #: correlation lengths of noise that are told apart, px
 NOISE_LENGTHS_PX = np.concatenate([[0.0], np.geomspace(0.3, 3.0, 24)])
 #: shorter correlation than this is none, px
@@ -33,50 +37,86 @@ _SQUARED_WEIGHTS = 20.0
 _MARGIN = 2
 
 
-def rough_noise(blobs: Blobs, quiet: BoolArray) -> FloatArray:
-    """Sd (k,) of what differs from pixel to pixel, before any fit, by the Laplacian, which no gradient moves.
+def ring_spread(blobs: Blobs) -> tuple[FloatArray, FloatArray]:
+    """Sd (k,) of the noise on the ring about each blob, and sd (k,) of what the ring holds beyond it.
 
-    ``quiet`` (k, p) says which pixels of the disc lie apart from any blob.
+    Noise differs from pixel to pixel: it is seen by the Laplacian, which no gradient moves; structure is what is left
+    when the ring's best plane is taken off.
     """
-    laplacian = _laplacian(blobs.values, 1).reshape(len(blobs), -1)[:, disc(blobs.radius)]
-    return _noise_sd(laplacian, quiet)
+    k, at = len(blobs), ring(blobs.radius)
+    values = blobs.values.reshape(k, -1)
+    nothing = np.isnan(values)
+    if nothing.any():
+        values = np.where(nothing, blobs.background[:, None], values)
+    seen = np.abs((values - blobs.background[:, None]) @ _ring_filters(blobs.radius))
+    noise, spread = MAD_TO_SD * nan_quantile(seen.reshape(k, 2, len(at)), 0.5).T
+    noise = np.maximum(noise, ROUNDING_SD)
+    return noise, np.sqrt(np.maximum(spread**2 - RING_NOISE * noise**2, 0.0))
 
 
-def noise_field(residuals: FloatArray, quiet: BoolArray, radius: int) -> tuple[FloatArray, float]:
-    """Sd (k,) of the noise about each spot, and its correlation length ℓ, px: exp(−d²/2ℓ²) at distance d.
+@cache
+def _ring_filters(radius: int) -> FloatArray:
+    """(n², 2p): a window → the Laplacian on the inner ring and what the best plane leaves on the outer ring."""
+    n, at = 2 * radius + 1, ring(radius)
+    u, v = (axis.ravel() for axis in grid(radius))
+    inside = np.maximum(np.abs(u), np.abs(v)) < radius
+    inner = np.flatnonzero(inside)[np.argsort(-np.hypot(u, v)[inside], kind="stable")][: len(at)]
+    laplacian = np.zeros((len(at), n * n))
+    _fill_laplacian(laplacian, inner, [inner + step for step in (-1, 1, -n, n)])
+    plane = np.stack([np.ones(len(at)), u[at], v[at]], axis=1)
+    flat = np.zeros((n * n, len(at)))
+    flat[at] = np.eye(len(at)) - plane @ np.linalg.pinv(plane)
+    return frozen(np.hstack([laplacian.T, flat]), (n * n, 2 * len(at)))
+
+
+def noise_field(residuals: FloatArray, quiet: BoolArray, radius: int) -> tuple[FloatArray, FloatArray, float]:
+    """What a fit left, as noise: what of it differs from pixel to pixel, and what neighbours share.
 
     Seen through Laplacians of one and of two pixels: of white noise both show the same, of smooth noise the second
-    shows more. The length is that of the scanner's kernel, so all windows tell it together.
+    shows more. The correlation length is that of the scanner's kernel, so all windows tell it together.
 
     Args:
-        residuals: (k, p), what a fit left, at the pixels of the disc.
+        residuals: (k, p), at the pixels of the disc.
         quiet: (k, p), where to look.
         radius: of the windows, px.
+
+    Returns:
+        Sd (k,) of the noise if it is white; if it is correlated as exp(−d²/2ℓ²) over the distance d; and ℓ, px.
     """
-    k, n, at = len(residuals), 2 * radius + 1, disc(radius)
-    square = np.full((k, n * n), np.nan)
-    square[:, at] = residuals
-    windows = square.reshape(k, n, n)
-    fine, coarse = (_noise_sd(_laplacian(windows, d).reshape(k, -1)[:, at], quiet) for d in (1, 2))
+    k, (at, filters) = len(residuals), _noise_filters(radius)
+    known = quiet[:, at][:, None]
+    sample = np.where(known, np.abs(residuals @ filters).reshape(k, 2, len(at)), np.inf)
+    sample.sort(axis=-1)
+    count = np.count_nonzero(known, axis=-1)
+    median = sample[np.arange(k), :, np.maximum(count[:, 0] - 1, 0) // 2]
+    fine, coarse = np.maximum(MAD_TO_SD * np.where(count > 0, median, 0.0), ROUNDING_SD).T
     fine_gain, coarse_gain = _laplacian_gains()
     length = float(np.interp(np.median(coarse / fine), coarse_gain / fine_gain, NOISE_LENGTHS_PX))
-    return fine / np.interp(length, NOISE_LENGTHS_PX, fine_gain), length
+    return fine, fine / np.interp(length, NOISE_LENGTHS_PX, fine_gain), length
 
 
-def _laplacian(w: FloatArray, d: int) -> FloatArray:
-    """Of windows (k, n, n), with neighbours at ``d`` px; NaN at the border; of white noise, its own sd."""
-    laplacian = np.full(w.shape, np.nan)
-    inner = laplacian[:, d:-d, d:-d]
-    np.multiply(w[:, d:-d, d:-d], 4.0, out=inner)
-    for neighbour in (w[:, : -2 * d, d:-d], w[:, 2 * d :, d:-d], w[:, d:-d, : -2 * d], w[:, d:-d, 2 * d :]):
-        inner -= neighbour
-    inner *= 1.0 / np.sqrt(_SQUARED_WEIGHTS)
-    return laplacian
+@cache
+def _noise_filters(radius: int) -> tuple[IntArray, FloatArray]:
+    """Pixels (m,) of the disc, outermost first, and (p, 2m): residuals on the disc → their Laplacians of 1 and 2 px."""
+    n, at = 2 * radius + 1, disc(radius)
+    u, v = (axis.ravel()[at] for axis in grid(radius))
+    long, short = np.maximum(np.abs(u), np.abs(v)), np.minimum(np.abs(u), np.abs(v))
+    fits = np.flatnonzero(np.hypot(long + 2.0, short) <= radius + 0.5)
+    pixels = fits[np.argsort(-np.hypot(u, v)[fits], kind="stable")][:NOISE_SAMPLES]
+    place = np.full(n * n, -1)
+    place[at] = np.arange(len(at))
+    filters = np.zeros((2, len(pixels), len(at)))
+    for laplacian, d in zip(filters, (1, 2), strict=True):
+        _fill_laplacian(laplacian, pixels, [place[at[pixels] + step] for step in (-d, d, -d * n, d * n)])
+    return frozen_index(pixels), frozen(filters.reshape(-1, len(at)).T, (len(at), 2 * len(pixels)))
 
 
-def _noise_sd(sample: FloatArray, quiet: BoolArray) -> FloatArray:
-    median = nan_quantile(np.where(quiet, np.abs(sample), np.nan), 0.5)
-    return np.asarray(np.maximum(MAD_TO_SD * np.nan_to_num(median), ROUNDING_SD))
+def _fill_laplacian(rows: FloatArray, middle: IntArray, neighbours: list[IntArray]) -> None:
+    """Laplacians (m, p) at the pixels ``middle``; of white noise they show its own sd."""
+    each = np.arange(len(middle))
+    rows[each, middle] = 4.0 / np.sqrt(_SQUARED_WEIGHTS)
+    for neighbour in neighbours:
+        rows[each, neighbour] = -1.0 / np.sqrt(_SQUARED_WEIGHTS)
 
 
 @cache
@@ -94,27 +134,10 @@ def _laplacian_gains() -> tuple[FloatArray, FloatArray]:
     return gain(1), gain(2)
 
 
-def background_structure(blobs: Blobs, noise: FloatArray) -> FloatArray:
-    """Sd (k,) of what the ring about the blob holds beyond noise, after its best plane is taken off."""
-    values = blobs.values.reshape(len(blobs), -1)[:, ring(blobs.radius)]
-    values = np.where(np.isnan(values), blobs.background[:, None], values)
-    left = values - values @ _plane_projector(blobs.radius)
-    spread = MAD_TO_SD * nan_quantile(np.abs(left), 0.5)
-    return np.sqrt(np.maximum(spread**2 - noise**2, 0.0))
-
-
-@cache
-def _plane_projector(radius: int) -> FloatArray:
-    """(p, p): values on the ring → the best plane through them, there."""
-    u, v = (axis.ravel()[ring(radius)] for axis in grid(radius))
-    plane = np.stack([np.ones(len(u)), u, v], axis=1)
-    return frozen(plane @ np.linalg.pinv(plane), (len(u), len(u)))
-
-
 def odd_variance(
     residuals: FloatArray, near: BoolArray, centre: FloatArray, radius: int, noise: FloatArray
 ) -> FloatArray:
-    """Variance (k,) beyond noise of a field whose odd part about ``centre`` (2, k) is that of the residuals ``near`` it.
+    """Variance (k,) beyond noise of a field whose odd part about ``centre`` (2, k) is that of the residuals ``near``.
 
     Only what exceeds noise by its own standard error counts. A wrong shape of the profile leaves residuals that are
     even about the centre and do not move it; only odd ones do.
@@ -151,8 +174,9 @@ def centre_covariance(
     k, n = influence.shape[1], 2 * radius + 1
     square = np.zeros((2, k, n * n))
     square[:, :, disc(radius)] = influence
-    waves = _waves(radius)
-    spectrum = (waves @ square.reshape(2, k, n, n) @ waves.T).reshape(2, k, n * n).transpose(1, 0, 2)
+    waves = _waves(radius).T
+    half = (square.reshape(-1, n) @ waves).reshape(2 * k, n, n).transpose(0, 2, 1)  # two large products beat 4 k small
+    spectrum = (half.reshape(-1, n) @ waves).reshape(2, k, n * n).transpose(1, 0, 2)
     noise, length = smooth
     along, across = _power_along(length, radius), _structure_power(radius)
     power = np.stack([np.outer(along, along).ravel(), np.ones(n * n), np.outer(across, across).ravel()])
