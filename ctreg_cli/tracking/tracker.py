@@ -198,22 +198,16 @@ class Tracker:
         elif (again := self._repeated(spots, info, scale)) is not None:
             return again
         scene = self._scene(spots, info, scale)
-        why = ""
-        followed = None
+        followed, why = None, ""
         if prediction is not None:
             followed, why = self._servoed(prediction, scene)
         if prediction is not None and followed is not None:
-            sure = None
-            if not why:
-                sure = self._verified(prediction, scene, spots, scale, followed) or self._doubted(
-                    prediction, scene, spots, scale, followed
-                )
+            sure = self._verified(prediction, scene, spots, scale, followed)
+            sure = sure or self._doubted(prediction, scene, spots, scale, followed)
             if sure is not None and sure.status != "ok":
                 return self._lost(sure, prediction, scene)
             if sure is not None:
-                return self._remember(
-                    sure, self.options.jacobian, followed.servo.margin, prediction, spots, info, scale
-                )
+                return self._remember_followed(sure, followed, prediction, spots, info, scale)
         return self._registered(prediction, scene, spots, info, scale, followed, why)
 
     def follow(self, spots: Spots, info: SliceInfo, scale: Scale) -> Tracked | None:
@@ -225,13 +219,11 @@ class Tracker:
         if prediction is None:
             return None
         scene = self._scene(spots, info, scale)
-        followed, why = self._servoed(prediction, scene)
-        if followed is None or why:
+        followed, _ = self._servoed(prediction, scene)
+        sure = None if followed is None else self._verified(prediction, scene, spots, scale, followed)
+        if followed is None or sure is None:
             return None
-        sure = self._verified(prediction, scene, spots, scale, followed)
-        if sure is None:
-            return None
-        return self._remember(sure, self.options.jacobian, followed.servo.margin, prediction, spots, info, scale)
+        return self._remember_followed(sure, followed, prediction, spots, info, scale)
 
     def miss(self) -> None:
         """A slice that could not be read: time passes."""
@@ -263,12 +255,26 @@ class Tracker:
     # --- 1. servo ----------------------------------------------------------------------------------------------------
 
     def _servoed(self, prediction: Prediction, scene: Scene) -> tuple[_Followed | None, str]:
-        """The frame brought to the spots in its gates; and why it must be registered anew, if it must."""
-        model, constant = self.model, self.options.jacobian == "constant"
-        if constant and self._kept_jacobian is None:
-            return None, "no Jacobian has been kept yet"
+        """The frame brought to the spots in its gates; or why not.
+
+        A constant Jacobian that does not serve any more is given up for the one at hand, which is then kept.
+        """
         if len(scene.xy_mm) < CHECKABLE_MATCHES:
             return None, ""
+        if self.options.jacobian == "updated" or self._kept_jacobian is None:
+            return self._servoed_with(None, prediction, scene)
+        followed, why = self._servoed_with(self._kept_jacobian, prediction, scene)
+        if followed is not None:
+            why = _unfit(followed.servo)
+            if not why:
+                return followed, ""
+        anew, _ = self._servoed_with(None, prediction, scene)
+        return (None, why) if anew is None else (replace(anew, renewed=why), "")
+
+    def _servoed_with(
+        self, kept_jacobian: FloatArray | None, prediction: Prediction, scene: Scene
+    ) -> tuple[_Followed | None, str]:
+        model = self.model
         T, crossing = prediction.T, prediction.crossing
         spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance)
         for _ in range(_ASSIGNMENTS):
@@ -277,7 +283,7 @@ class Tracker:
                 return None, f"only {len(rods)} spots lie where the past expects them"
             spots = spot_of_rod[rods]
             desired = Desired.of(model, rods, scene.xy_mm.take(spots, axis=0), scene.covariance_mm.take(spots, axis=0))
-            kept = self._kept_jacobian[rods].reshape(-1, 6) if constant and self._kept_jacobian is not None else None
+            kept = None if kept_jacobian is None else kept_jacobian[rods].reshape(-1, 6)
             all_seen = len(rods) == len(model)
             try:
                 moved = servo(
@@ -303,14 +309,7 @@ class Tracker:
             spot_of_rod = again
         else:
             return None, "the matches did not settle"
-        followed = _Followed(spot_of_rod=spot_of_rod, servo=moved, outlook=outlook)
-        if constant:
-            if moved.margin < LEAST_MARGIN:
-                return followed, f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
-            information = moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian
-            if float((information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
-                return followed, "the constant Jacobian has become inefficient"
-        return followed, ""
+        return _Followed(spot_of_rod=spot_of_rod, servo=moved, outlook=outlook), ""
 
     def _verified(
         self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
@@ -423,6 +422,21 @@ class Tracker:
 
     # --- memory ------------------------------------------------------------------------------------------------------
 
+    def _remember_followed(
+        self,
+        sure: Registration,
+        followed: _Followed,
+        prediction: Prediction,
+        spots: Spots,
+        info: SliceInfo,
+        scale: Scale,
+    ) -> Tracked:
+        """Take in a sure pose that the servo came to."""
+        if followed.renewed:
+            sure = replace(sure, warnings=(*sure.warnings, ("registered_anew", followed.renewed)))
+        method = "registered" if followed.renewed else self.options.jacobian
+        return self._remember(sure, method, followed.servo.margin, prediction, spots, info, scale)
+
     def _remember(
         self,
         sure: Registration,
@@ -494,6 +508,18 @@ class _Followed:
     spot_of_rod: IntArray
     servo: ServoResult
     outlook: Outlook
+    #: why the constant Jacobian was given up for the one at hand; empty where it was not
+    renewed: str = ""
+
+
+def _unfit(moved: ServoResult) -> str:
+    """Why a constant Jacobian is not trusted any more; empty while it is."""
+    if moved.margin < LEAST_MARGIN:
+        return f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
+    information = moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian
+    if float((information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
+        return "the constant Jacobian has become inefficient"
+    return ""
 
 
 def _time_since(past: _Past, info: SliceInfo) -> float | None:
