@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.imaging.maxima import local_maxima, smoothed
 from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, ring
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
@@ -17,6 +20,13 @@ SPLIT_LEVELS, SPLIT_DEPTH = (0.65, 0.85), 12.0
 BACKGROUND_PX = 4.0
 #: a window is moved to its blob's centre at most so often; once is nearly always enough
 RECENTRINGS = 3
+#: a blob's peak lies within this of its window's middle, px
+CORE_PX = 2.0
+#: beyond so many half widths of a lone blob nothing stands out by more than so many spreads of the ring, which no noise
+#: does; but by a tenth of its height in any case (what is fainter is no rod beside it), by a fifth in none
+SKIRT, LONE_SPREADS, LONE_SHARES = 2.2, 7.0, (0.1, 0.2)
+#: its peak is looked for away from the window's edge, px
+INNER_PX = 2
 #: a pixel is 1/12 px² wide in second moments
 _PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -92,6 +102,12 @@ class Blobs:
         return Blobs(radius=self.radius, **arrays)
 
 
+def joined(parts: Sequence[Blobs]) -> Blobs:
+    """All blobs of several sets in windows of one radius."""
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    return Blobs(radius=parts[0].radius, **arrays)
+
+
 def measure_blobs(image: UprightImage, peaks: IntArray, radius: int) -> Blobs:
     """Measure the blobs at ``peaks`` (k, 2) in windows centred on the blobs themselves.
 
@@ -110,14 +126,67 @@ def measure_blobs(image: UprightImage, peaks: IntArray, radius: int) -> Blobs:
     return blobs
 
 
+def measure_lone_blobs(image: UprightImage, peaks: IntArray, radius: int) -> tuple[Blobs, BoolArray]:
+    """The blobs at ``peaks`` (k, 2) where nothing is beside them, and where (k,) that is so.
+
+    Those are what :func:`measure_blobs` finds, but for the search of what hangs together: of a lone blob all that is
+    bright is its own. Elsewhere the numbers mean nothing.
+    """
+    blobs = _measure_lone(image, peaks, radius)
+    moved = np.flatnonzero((np.abs(blobs.centre) > 0.5).any(axis=1))
+    if len(moved):
+        middles = np.rint(blobs.uv_px[moved]).astype(np.intp)
+        blobs = blobs.replaced(moved, _measure_lone(image, middles, radius))
+    return blobs, _is_lone(blobs)
+
+
+def _measure_lone(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
+    values = image.windows(middles, radius)
+    k = len(values)
+    background = nan_quantile(values.reshape(k, -1)[:, ring(radius)], BACKGROUND_QUANTILE)
+    height = values.reshape(k, -1)[:, _core(radius)].max(axis=1) - background
+    own = values > (background + 0.5 * height)[:, None, None]
+    centre, moments = _moments(own, radius)
+    return Blobs(
+        middles=middles,
+        radius=radius,
+        values=values,
+        background=background,
+        height=height,
+        own=own,
+        foreign=np.zeros_like(own),
+        centre=centre,
+        moments=moments,
+    )
+
+
+def _is_lone(blobs: Blobs) -> BoolArray:
+    """Whether (k,) a window holds one peak, apart from its edge and far above all that is not close to it."""
+    k, radius = len(blobs), blobs.radius
+    u, v = grid(radius)
+    x, y = u - blobs.centre[:, 0, None, None], v - blobs.centre[:, 1, None, None]
+    uu, uv, vv = inverse_elements(blobs.moments)
+    # a uniform ellipse has moments of a quarter of its semi-axes squared
+    reach = uu[:, None, None] * x * x + vv[:, None, None] * y * y + 2.0 * uv[:, None, None] * x * y > 4.0 * SKIRT**2
+    beside = np.where(reach, blobs.values, -np.inf).reshape(k, -1).max(axis=1)
+    spread = _spread(blobs.values.reshape(k, -1)[:, ring(radius)], blobs.background)
+    low, high = (share * blobs.height for share in LONE_SHARES)
+    highest = blobs.background + np.clip(LONE_SPREADS * spread, low, high)
+    lone = np.isfinite(blobs.values.sum(axis=(1, 2))) & (np.abs(blobs.centre) <= 0.5).all(axis=1) & ~blobs.cut_off
+    lone &= beside < highest
+    inner = smoothed(blobs.values[:, INNER_PX:-INNER_PX, INNER_PX:-INNER_PX])
+    peaks = local_maxima(inner) & (inner > highest[:, None, None])
+    lone &= np.count_nonzero(peaks, axis=(1, 2)) == 1
+    return np.asarray(lone)
+
+
 def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
     values = image.windows(middles, radius)
     k = len(values)
-    u, v = grid(radius)
     background = np.nan_to_num(nan_quantile(values.reshape(k, -1)[:, ring(radius)], BACKGROUND_QUANTILE))
     above = np.where(np.isnan(values), -np.inf, values - background[:, None, None])
-    core = np.hypot(u, v) < 2.0
-    peak = np.where(core, above, -np.inf).reshape(k, -1).argmax(axis=1)
+    core = _core(radius)
+    peak = core[above.reshape(k, -1)[:, core].argmax(axis=1)]
     height = above.reshape(k, -1)[np.arange(k), peak]
     bright = above > 0.5 * height[:, None, None]
     own = _joined_to(bright, peak)
@@ -127,14 +196,7 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         if len(clear):
             high = above[clear] > level * height[clear, None, None]
             own[clear] = _apart_from_neighbour(own[clear], own[clear] & high, peak[clear])
-    count = np.maximum(own.sum(axis=(1, 2)), 1)
-    flat = own.reshape(k, -1).astype(np.float64)
-    basis = np.stack([u, v, u * u, u * v, v * v]).reshape(5, -1)
-    mean_u, mean_v, uu, uv, vv = (flat @ basis.T).T / count
-    moments = np.empty((k, 2, 2))
-    moments[:, 0, 0] = uu - mean_u**2 + _PIXEL_VARIANCE
-    moments[:, 1, 1] = vv - mean_v**2 + _PIXEL_VARIANCE
-    moments[:, 0, 1] = moments[:, 1, 0] = uv - mean_u * mean_v
+    centre, moments = _moments(own, radius)
     return Blobs(
         middles=middles,
         radius=radius,
@@ -143,9 +205,41 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         height=height,
         own=own,
         foreign=bright & ~own,
-        centre=np.stack([mean_u, mean_v], axis=1),
+        centre=centre,
         moments=moments,
     )
+
+
+@cache
+def _core(radius: int) -> IntArray:
+    """Flat indices of the pixels about the middle of a window in which its blob's peak lies."""
+    return frozen_index(np.flatnonzero(np.hypot(*grid(radius)) < CORE_PX))
+
+
+def _moments(own: BoolArray, radius: int) -> tuple[FloatArray, FloatArray]:
+    """Centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, n, n), px."""
+    flat = own.reshape(len(own), -1).astype(np.float64)
+    count, mean_u, mean_v, uu, uv, vv = _monomials(radius) @ flat.T
+    count = np.maximum(count, 1.0)
+    centre = np.stack([mean_u, mean_v], axis=1) / count[:, None]
+    moments = np.stack([uu, uv, uv, vv], axis=1).reshape(-1, 2, 2) / count[:, None, None]
+    moments -= centre[:, :, None] * centre[:, None]
+    moments[:, [0, 1], [0, 1]] += _PIXEL_VARIANCE
+    return centre, moments
+
+
+@cache
+def _monomials(radius: int) -> FloatArray:
+    """(6, n²): 1, u, v, u², uv, v² at the pixels of a window."""
+    u, v = (axis.ravel() for axis in grid(radius))
+    return frozen(np.stack([np.ones(u.size), u, v, u * u, u * v, v * v]), (6, u.size))
+
+
+def inverse_elements(symmetric: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Elements uu, uv, vv (k,) of the inverses of (k, 2, 2)."""
+    uu, uv, vv = symmetric[:, 0, 0], symmetric[:, 0, 1], symmetric[:, 1, 1]
+    determinant = uu * vv - uv * uv
+    return vv / determinant, -uv / determinant, uu / determinant
 
 
 def _spread(ring_values: FloatArray, background: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.imaging.blob import Blobs
+from ctreg_cli.imaging.blob import Blobs, inverse_elements
 from ctreg_cli.imaging.fit import fit
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, in_pixels
 from ctreg_cli.imaging.uncertainty import (
@@ -128,7 +128,9 @@ def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolAr
 def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatArray:
     """Distance (k, p) of pixels outside the ellipse of the blob's half-height moments, px; 0 inside."""
     x, y = u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None]
-    uu, uv, vv = _inverse(4.0 * blobs.moments)  # a uniform ellipse has moments of a quarter of its semi-axes squared
+    uu, uv, vv = inverse_elements(
+        4.0 * blobs.moments
+    )  # a uniform ellipse has moments of a quarter of its semi-axes squared
     xx, yy = x * x, y * y
     q = uu[:, None] * xx
     q += vv[:, None] * yy
@@ -139,13 +141,6 @@ def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatAr
     distance = np.sqrt(xx)
     distance -= np.sqrt(xx / np.maximum(q, 1e-18))
     return np.maximum(distance, 0.0, out=distance)
-
-
-def _inverse(symmetric: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Elements uu, uv, vv (k,) of the inverses of (k, 2, 2)."""
-    uu, uv, vv = symmetric[:, 0, 0], symmetric[:, 0, 1], symmetric[:, 1, 1]
-    determinant = uu * vv - uv * uv
-    return vv / determinant, -uv / determinant, uu / determinant
 
 
 def _brightest(blobs: Blobs, values: FloatArray, about: BoolArray, u: FloatArray, v: FloatArray) -> FloatArray:
@@ -166,7 +161,7 @@ def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray) -> FloatArray:
     """
     flat = np.minimum(n_clipped / blobs.area, MAX_FLAT_SHARE)
     log2_over = np.maximum(flat / (1.0 - flat), MIN_LOG2_OVER)
-    uu, uv, vv = _inverse(4.0 * (blobs.moments + START_BLUR_PX2 * np.eye(2)))
+    uu, uv, vv = inverse_elements(4.0 * (blobs.moments + START_BLUR_PX2 * np.eye(2)))
     wider = (1.0 + log2_over) ** np.exp(-START_LOG_BETA)
     l_vv = np.sqrt(vv * wider)
     l_uv = uv * wider / l_vv

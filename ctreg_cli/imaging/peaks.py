@@ -34,33 +34,6 @@ class Peaks:
         return Peaks(pixels=self.pixels[which], contrast=self.contrast[which], half_width=self.half_width[which])
 
 
-def smoothed(image: NDArray[Any]) -> NDArray[Any]:
-    """Binomial 3 × 3 mean over the last two axes; the outermost pixels stay as they are, NaN become the least value."""
-    if np.isnan(image.min(initial=0)):
-        image = np.where(np.isnan(image), np.nanmin(image, initial=np.inf), image)
-    out = image.copy()
-    rows = image[..., :-2, :] + image[..., 2:, :]
-    rows += 2 * image[..., 1:-1, :]
-    inner = rows[..., :-2] + rows[..., 2:]
-    inner += 2 * rows[..., 1:-1]
-    inner *= 1 / 16
-    out[..., 1:-1, 1:-1] = inner
-    return out
-
-
-def local_maxima(smooth: NDArray[Any]) -> BoolArray:
-    """Pixels not lower than their 8 neighbours (last two axes); of a flat top only the first in reading order."""
-    inner = smooth[..., 1:-1, 1:-1]
-    rows, columns = smooth.shape[-2:]
-    highest = np.ones(inner.shape, dtype=bool)
-    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        highest &= inner > smooth[..., 1 - dr : rows - 1 - dr, 1 - dc : columns - 1 - dc]
-        highest &= inner >= smooth[..., 1 + dr : rows - 1 + dr, 1 + dc : columns - 1 + dc]
-    maxima = np.zeros(smooth.shape, dtype=bool)
-    maxima[..., 1:-1, 1:-1] = highest
-    return maxima
-
-
 def image_noise(image: NDArray[Any]) -> float:
     """Sd of the pixel noise of an image by the median Laplacian of every eighth row; flat (clipped) air is left out."""
     inner = image[1:-1:8, 1:-1]

@@ -17,12 +17,13 @@ from typing import Literal
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, measure_blobs
+from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, joined, measure_blobs, measure_lone_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
-from ctreg_cli.imaging.peaks import Peaks, image_noise, local_maxima, maxima_above, rate_peaks, smoothed
+from ctreg_cli.imaging.maxima import local_maxima, smoothed
+from ctreg_cli.imaging.peaks import Peaks, image_noise, maxima_above, rate_peaks
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
-from ctreg_cli.imaging.window import UprightImage
+from ctreg_cli.imaging.window import UprightImage, grid
 
 Polarity = Literal["bright", "dark", "auto"]
 
@@ -115,7 +116,9 @@ def _find(slice_: Slice, options: SegmentationOptions, *, bright: bool) -> Spots
         rows, columns = maxima_above(smooth, margin)
         pixels, heights = np.stack([columns, rows], axis=1), smooth[rows, columns].astype(np.float64)
         peaks = rate_peaks(image, pixels, heights, 0.5 * limits.width_px)
-        spots = _spots_at(image, peaks.take(peaks.contrast > margin), limits, options)
+        rejections = _Rejections()
+        groups = _blobs_at(image, peaks.take(peaks.contrast > margin), limits, options, rejections)
+        spots = _spots_of(image, groups, options, rejections)
         needed = max(least, share * float(spots.contrast.max(initial=0.0)) / image.unit)
         if margin <= needed:
             return spots
@@ -131,7 +134,40 @@ def _measure(
     uv, radius = uv[usable], radius[usable]
     if not len(uv):
         return _EMPTY
-    image = UprightImage.of(slice_, bright=bright)
+    image, limits, rejections = UprightImage.of(slice_, bright=bright), _Limits.of(slice_, options), _Rejections()
+    lone, settled = _lone_blobs(image, uv, radius, limits)
+    groups = [lone] if len(lone) else []
+    if not settled.all():
+        peaks = _peaks_about(image, uv[~settled], radius[~settled], limits)
+        groups += _blobs_at(image, peaks.take(peaks.contrast > 0), limits, options, rejections)
+    spots = _spots_of(image, _merged(groups), options, rejections)
+    near = (np.linalg.norm(spots.uv_px[:, None] - uv, axis=2) <= radius).any(axis=1)
+    return spots if near.all() else spots.take(near)
+
+
+def _lone_blobs(image: UprightImage, uv: FloatArray, radius: FloatArray, limits: _Limits) -> tuple[Blobs, BoolArray]:
+    """Blobs near those predictions that have one, well apart from all else; and which (k,) predictions these are.
+
+    In such windows there is nothing to search for and nothing to sort out.
+    """
+    middles = np.rint(uv).astype(np.intp)
+    reach = int(radius.max()) + 1
+    u, v = grid(reach)
+    off_u, off_v = u + (middles - uv)[:, 0, None, None], v + (middles - uv)[:, 1, None, None]
+    within = off_u * off_u + off_v * off_v <= (radius * radius)[:, None, None]
+    windows = np.where(within, image.windows(middles, reach), -np.inf)
+    rows, columns = np.divmod(windows.reshape(len(uv), -1).argmax(axis=1), 2 * reach + 1)
+    blobs, lone = measure_lone_blobs(image, middles + np.stack([columns, rows], axis=1) - reach, WINDOW_RADII_PX[0])
+    major, minor, _ = blobs.axes
+    lone &= (minor <= limits.width_px) & (major <= limits.length_px)
+    lone &= np.hypot(*(blobs.uv_px - uv).T) + radius <= blobs.radius  # so that its window shows all that was looked at
+    between = np.hypot(*(blobs.uv_px[:, None] - blobs.uv_px).transpose(2, 0, 1))
+    lone &= np.count_nonzero(between <= blobs.radius, axis=1) == 1
+    return (blobs if lone.all() else blobs.take(lone)), lone
+
+
+def _peaks_about(image: UprightImage, uv: FloatArray, radius: FloatArray, limits: _Limits) -> Peaks:
+    """All peaks near predictions."""
     reach = int(np.ceil(radius.max())) + 2
     middles = np.rint(uv).astype(np.intp)
     windows = smoothed(image.windows(middles, reach))
@@ -140,11 +176,14 @@ def _measure(
     heights = windows[which, rows, columns]
     looked_at = ((pixels - uv[which]) ** 2).sum(axis=1) <= (radius[which] + 1.0) ** 2
     looked_at &= heights > np.median(windows, axis=(1, 2))[which]
-    limits = _Limits.of(slice_, options)
-    peaks = rate_peaks(image, pixels[looked_at], heights[looked_at], 0.5 * limits.width_px)
-    spots = _spots_at(image, peaks.take(peaks.contrast > 0), limits, options)
-    distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2)
-    return spots.take((distance <= radius).any(axis=1))
+    return rate_peaks(image, pixels[looked_at], heights[looked_at], 0.5 * limits.width_px)
+
+
+def _merged(groups: Sequence[Blobs]) -> list[Blobs]:
+    """The same blobs, those in windows of one size together."""
+    radii = dict.fromkeys(group.radius for group in groups)
+    same = ([group for group in groups if group.radius == radius] for radius in radii)
+    return [parts[0] if len(parts) == 1 else joined(parts) for parts in same]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -183,9 +222,10 @@ class _Rejections:
         self.spots += [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:room]]
 
 
-def _spots_at(image: UprightImage, peaks: Peaks, limits: _Limits, options: SegmentationOptions) -> Spots:
-    """Measure the blobs at ``peaks``, sort out what is no spot, fit and rank the rest."""
-    rejections = _Rejections()
+def _blobs_at(
+    image: UprightImage, peaks: Peaks, limits: _Limits, options: SegmentationOptions, rejections: _Rejections
+) -> list[Blobs]:
+    """Blobs at ``peaks`` that could be spots, in groups of one size of window."""
     peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
     large = peaks.half_width > 0.5 * limits.width_px + 1.0
     rejections.add(peaks.pixels[large], "too_large")
@@ -194,9 +234,15 @@ def _spots_at(image: UprightImage, peaks: Peaks, limits: _Limits, options: Segme
     faint = (peaks.contrast < least) | (np.arange(len(peaks.pixels)) >= PEAKS_PER_SPOT * options.max_spots)
     groups = _blobs(image, peaks.pixels[~faint], limits, rejections)
     rejections.add(peaks.pixels[faint], "low_contrast")
+    return groups
+
+
+def _spots_of(
+    image: UprightImage, groups: Sequence[Blobs], options: SegmentationOptions, rejections: _Rejections
+) -> Spots:
+    """The best blobs, fitted and ranked."""
     if not groups:
         return Spots(uv_px=_EMPTY.uv_px, covariance_px=_EMPTY.covariance_px, rejected=tuple(rejections.spots))
-
     chosen = _choose(groups, options, rejections)
     ends = np.cumsum([len(group) for group in groups])[:-1]
     parts = [group.take(part) for group, part in zip(groups, np.split(chosen, ends), strict=True) if part.any()]

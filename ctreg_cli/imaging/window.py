@@ -32,11 +32,12 @@ class UprightImage:
         """View ``slice_`` with spots upright; a negative rescale slope turns the stored values over once more."""
         sign = float(np.sign(slice_.slope)) * (1.0 if bright else -1.0)
         stored = slice_.stored
-        if slice_.padding is not None:
-            valid = stored[~slice_.is_padding(stored)]
-        else:
-            valid = stored.ravel() if np.issubdtype(stored.dtype, np.integer) else stored[np.isfinite(stored)]
-        ceiling = float(valid.max() if sign > 0 else valid.min()) * sign if valid.size else -np.inf
+        counted = np.issubdtype(stored.dtype, np.integer)
+        extreme = (stored.max() if sign > 0 else stored.min()) if stored.size and counted else np.nan
+        if not counted or (slice_.padding is not None and slice_.padding[0] <= extreme <= slice_.padding[1]):
+            valid = stored[np.isfinite(stored) & ~slice_.is_padding(stored)]
+            extreme = (valid.max() if sign > 0 else valid.min()) if valid.size else np.nan
+        ceiling = -np.inf if np.isnan(extreme) else float(extreme) * sign
         return cls(source=slice_, sign=sign, ceiling=ceiling)
 
     @property
@@ -77,7 +78,8 @@ class UprightImage:
             flat[outside] = 0
         stored = self.source.stored.ravel().take(flat)  # one flat index costs half of a pair
         values: FloatArray = stored * self.sign
-        if self.source.padding is not None:
+        padding = self.source.padding
+        if padding is not None and stored.size and padding[1] >= stored.min() and padding[0] <= stored.max():
             values[self.source.is_padding(stored)] = np.nan
         if outside is not None:
             values[outside] = np.nan
