@@ -121,6 +121,7 @@ def _slice_data(record: SliceRecord, document: ResultsDocument, picture: str | N
             [m.rod, round(m.u_px, 3), round(m.v_px, 3), round(m.residual_u_px, 4), round(m.residual_v_px, 4)]
             for m in record.matches
         ],
+        "free": [[round(u, 3), round(v, 3)] for u, v in record.unmatched_px.tolist()],
         "missing": list(record.missing_rods),
         "tre": [[t.id, [round(c, 3) for c in t.position_slice.tolist()], round(t.tre_mm, 4)] for t in record.targets],
     }
@@ -217,8 +218,8 @@ def _targets(usable: Iterable[SliceRecord]) -> str:
             f"<td>{max(errors):.3g}</td><td>{level}</td></tr>"
         )
     head = (
-        "<tr><th>target</th><th>ok slices</th><th>median TRE (mm)</th><th>greatest TRE (mm)</th>"
-        "<th>greatest protection level (mm)</th></tr>"
+        "<tr><th>target</th><th>ok slices</th><th>median TRE</th><th>greatest TRE</th>"
+        '<th>greatest <abbr title="protection level">PL</abbr></th></tr>'
     )
     return f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
 
@@ -226,11 +227,12 @@ def _targets(usable: Iterable[SliceRecord]) -> str:
 def _slices(records: Sequence[SliceRecord]) -> str:
     rows = [
         f'<tr><td><a href="#slice" data-at="{k}">{record.index}</a></td><td>{escape(record.source)}</td>'
-        f'<td class="word {record.status}">{record.status}</td><td>{escape(_verdict(record))}</td></tr>'
+        f'<td><span class="{record.status}">{record.status}</span>'
+        f"{escape(_verdict(record).removeprefix(record.status))}</td></tr>"
         for k, record in enumerate(records)
     ]
-    head = "<tr><th>slice</th><th>file</th><th>status</th><th>verdict</th></tr>"
-    return f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>"
+    head = "<tr><th>slice</th><th>file</th><th>verdict</th></tr>"
+    return f'<table class="slices"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>'
 
 
 def _provenance(document: ResultsDocument) -> str:
@@ -247,7 +249,7 @@ def _provenance(document: ResultsDocument) -> str:
         for name, value in rows
         if value != ""
     )
-    return f"<table><tbody>{body}</tbody></table>"
+    return f'<table class="provenance"><tbody>{body}</tbody></table>'
 
 
 def _scale_words(document: ResultsDocument) -> str:

@@ -29,8 +29,13 @@ class View:
 
 
 def common_view(records: tuple[SliceRecord, ...]) -> View | None:
-    """The square in which all matched spots of all slices lie, with a border; None where nothing was matched."""
+    """The square in which all matched spots of all slices lie, with a border.
+
+    Where nothing was matched in any slice it is that of the spots there are; None where there are none either.
+    """
     spots = np.array([(match.u_px, match.v_px) for record in records for match in record.matches])
+    if not len(spots):
+        spots = np.concatenate([np.empty((0, 2)), *(record.unmatched_px for record in records)])
     if not len(spots):
         return None
     low, high = spots.min(axis=0), spots.max(axis=0)

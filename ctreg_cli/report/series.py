@@ -8,6 +8,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry.pose import difference
+from ctreg_cli.io.image_files import natural_key
 from ctreg_cli.io.results_document import SliceRecord
 
 #: names and units of the six components
@@ -63,10 +64,10 @@ def pose_series(records: tuple[SliceRecord, ...]) -> PoseSeries:
 
 
 def residuals(records: tuple[SliceRecord, ...]) -> dict[str, FloatArray]:
-    """Residuals (k, 2) in u and v, px, of every rod matched in a usable slice, in order of first appearance."""
+    """Residuals (k, 2) in u and v, px, of every rod matched in a usable slice; r2 before r10."""
     found: dict[str, list[tuple[float, float]]] = {}
     for record in records:
         if record.status == "ok":
             for match in record.matches:
                 found.setdefault(match.rod, []).append((match.residual_u_px, match.residual_v_px))
-    return {rod: np.array(pairs) for rod, pairs in found.items()}
+    return {rod: np.array(found[rod]) for rod in sorted(found, key=natural_key)}

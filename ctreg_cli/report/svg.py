@@ -14,6 +14,8 @@ from ctreg_cli.arrays import FloatArray
 #: of a chart, in its own units; the page scales it
 WIDTH, HEIGHT = 360.0, 170.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 8.0, 20.0, 30.0
+#: height of a rod's residuals, screen pixels, and the least range they are drawn over
+ROW_PX, LEAST_REACH_PX = 26.0, 1e-3
 _TICKS = 5
 
 
@@ -109,32 +111,38 @@ def curve(
 
 
 def residuals_by_rod(rods: Sequence[str], residuals: Sequence[FloatArray]) -> str:
-    """Residuals along u (above) and v (below) of every rod.
+    """Residuals along u (above) and v (below) of every rod: a table, so that words keep their size on a phone.
 
     Args:
         rods: names.
         residuals: for each rod (k, 2), px.
     """
-    row, width = 26.0, 720.0
-    height = TOP + row * max(len(rods), 1) + BOTTOM
     everything = np.concatenate([np.zeros((1, 2)), *residuals]).ravel()
-    reach = max(float(np.abs(everything).max()), 1e-3)
-    label = 12 + 7 * max((len(rod) for rod in rods), default=0)
-    across = Axis(low=-1.05 * reach, high=1.05 * reach, start=float(label), stop=width - 90)
-    down = Axis(low=0, high=max(len(rods), 1), start=TOP, stop=height - BOTTOM)
-    parts = [_grid(across, height, "residual (px)", across.stop)]
-    for k, (rod, values) in enumerate(zip(rods, residuals, strict=True)):
-        y = down(k + 0.5)
-        parts.append(f'<text class="label" x="{label - 6}" y="{number(y + 4)}" text-anchor="end">{escape(rod)}</text>')
-        for column, shift, kind in ((0, -5, "u"), (1, 5, "v")):
-            parts += [
-                f'<circle class="{kind}" cx="{number(across(value))}" cy="{number(y + shift)}" r="2.2"/>'
-                for value in values[:, column].tolist()
-            ]
-        rms = math.sqrt(float((values**2).mean())) if values.size else math.nan
-        if math.isfinite(rms):
-            parts.append(f'<text class="label" x="{width - 80}" y="{number(y + 4)}">{rms:.3f} px rms</text>')
-    return _svg("wide chart", width, height, "residuals by rod", parts)
+    reach = max(float(np.abs(everything).max()), LEAST_REACH_PX) * 1.05
+    percent = Axis(low=-reach, high=reach, start=0.0, stop=100.0)
+    grid = "".join(
+        f'<line class="grid" x1="{number(percent(tick))}%" x2="{number(percent(tick))}%" y1="0" y2="{ROW_PX:g}"/>'
+        for tick in percent.ticks()
+    )
+    rows = []
+    for rod, values in zip(rods, residuals, strict=True):
+        dots = "".join(
+            f'<circle class="{kind}" cx="{percent(value):.2f}%" cy="{y:g}" r="2.4"/>'
+            for kind, y, column in (("u", 0.3 * ROW_PX, 0), ("v", 0.7 * ROW_PX, 1))
+            for value in values[:, column].tolist()
+        )
+        rms = f"{math.sqrt(float((values**2).mean())):.3f}" if values.size else ""
+        rows.append(
+            f'<tr><th scope="row">{escape(rod)}</th><td class="dots"><svg class="row" role="img" '
+            f'aria-label="residuals of {escape(rod)}">{grid}{dots}</svg></td><td>{rms}</td></tr>'
+        )
+    ticks = "".join(
+        f'<text class="tick" x="{number(percent(tick))}%" y="12" text-anchor="middle">{text}</text>'
+        for tick, text in percent.labels()
+    )
+    rows.append(f'<tr><td></td><td class="dots"><svg class="row" aria-hidden="true">{ticks}</svg></td><td></td></tr>')
+    head = '<tr><th>rod</th><th class="dots">residual (px)</th><th>rms (px)</th></tr>'
+    return f'<table class="residuals"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>'
 
 
 def _runs(usable: Sequence[bool]) -> Iterator[tuple[int, int]]:
@@ -158,18 +166,6 @@ def _frame(across: Axis, up: Axis, x_name: str, title: str) -> str:
         x = number(across(tick))
         parts.append(f'<text class="tick" x="{x}" y="{HEIGHT - BOTTOM + 13}" text-anchor="middle">{text}</text>')
     parts.append(f'<text class="tick" x="{WIDTH - RIGHT}" y="{HEIGHT - 3}" text-anchor="end">{escape(x_name)}</text>')
-    return "".join(parts)
-
-
-def _grid(across: Axis, height: float, name: str, right: float) -> str:
-    parts = []
-    for tick, text in across.labels():
-        x = number(across(tick))
-        parts.append(f'<line class="grid" x1="{x}" x2="{x}" y1="{TOP}" y2="{height - BOTTOM}"/>')
-        parts.append(
-            f'<text class="tick" x="{x}" y="{number(height - BOTTOM + 13)}" text-anchor="middle">{text}</text>'
-        )
-    parts.append(f'<text class="tick" x="{right}" y="{number(height - 3)}" text-anchor="end">{escape(name)}</text>')
     return "".join(parts)
 
 

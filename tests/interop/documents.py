@@ -87,7 +87,8 @@ def document_text(seed: int = 0, *, with_uids: bool = True, patient: bool = True
                 for rod in range(3)
                 if has_pose
             ],
-            "missing_rods": [],
+            "unmatched_px": [[110.0, 100.0], [104.0, 112.0]],
+            "missing_rods": [model.ids[3]] if has_pose else [],
             "targets": [
                 {
                     "id": "tip",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
+from collections.abc import Iterator
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +18,10 @@ from ctreg_cli.io.results_document import ResultsDocument, read_document
 from ctreg_cli.report.html import report_html, shown_view
 from ctreg_cli.report.pictures import View, picture
 from ctreg_cli.report.series import pose_series
-from tests.interop.documents import STATUSES, document_text, frame
+from tests.interop.documents import SCALE_MM, STATUSES, document_text, frame
 
-#: names of local programs that are a Chromium
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
+from .browser import BROWSER, Browser, open_browser
+
 VOID = {"meta", "link", "input", "br", "img"}
 
 
@@ -83,8 +83,12 @@ def test_page_counts_and_tells_every_slice(page: str) -> None:
     assert "weak geometry: tilt about x is known to 9° only" in unescape(page)
 
 
-def test_hostile_names_stay_text(tmp_path: Path) -> None:
-    evil = '</script><script>alert(1)</script><img src=x onerror=alert(1)>"&'
+EVIL = "</script><script>window.hit = 1</script><img src=x onerror=window.hit=1>\"'&"
+
+
+def hostile_text() -> str:
+    """A document with a script wherever it holds a word."""
+    evil = EVIL
     data = json.loads(document_text())
     data["model"]["name"] = evil
     for row in data["results"]:
@@ -94,9 +98,15 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
             match["rod"] = evil
         for target in row["targets"]:
             target["id"] = evil
+        row["missing_rods"] = [evil]
+        row["warnings"] = [{"code": evil, "text": evil}]
     data["options"] = {evil: evil}
-    page = report_html(read(tmp_path, json.dumps(data)))
-    assert "<script>alert" not in page
+    return json.dumps(data)
+
+
+def test_hostile_names_stay_text(tmp_path: Path) -> None:
+    page = report_html(read(tmp_path, hostile_text()))
+    assert "<script>window" not in page
     assert "<img" not in page
     parser = Balance()
     parser.feed(page)
@@ -160,76 +170,117 @@ def test_two_hundred_slices_fit_in_six_megabytes(tmp_path: Path) -> None:
     assert len(page.encode()) <= 6_000_000
 
 
-def run_in_browser(page: str, script: str, tmp_path: Path, width: int) -> tuple[dict[str, object], str]:
-    """Load the page, let ``script`` act on it and fill ``seen``; give that and what the browser logged."""
-    acting = f"""<script>
-      const seen = {{violations: []}};
-      addEventListener("securitypolicyviolation", (e) => seen.violations.push(e.blockedURI));
-      addEventListener("error", (e) => seen.violations.push(e.message));
-      addEventListener("load", () => setTimeout(() => {{ {script}
-        seen.resources = performance.getEntriesByType("resource").map((entry) => entry.name);
-        document.body.setAttribute("data-seen", JSON.stringify(seen)); }}, 50));
-    </script></head>"""
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="Debian package chromium is not installed")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with open_browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+def shown(browser: Browser, page: str, tmp_path: Path, **screen: Any) -> None:
     path = tmp_path / "page.html"
-    path.write_text(page.replace("</head>", acting, 1), encoding="utf-8")
-    assert BROWSER is not None
-    done = subprocess.run(
-        [
-            *(BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"),
-            *("--disable-component-update", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}"),
-            *("--enable-logging=stderr", f"--window-size={width},900", "--virtual-time-budget=2000", "--dump-dom"),
-            path.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=90,
+    path.write_text(page, encoding="utf-8")
+    browser.show(path, **screen)
+
+
+def verdict(browser: Browser) -> str:
+    return str(browser.evaluate("document.getElementById('verdict').textContent"))
+
+
+def drawn(browser: Browser) -> str:
+    return str(browser.evaluate("document.getElementById('scene').toDataURL()"))
+
+
+def count(browser: Browser, selector: str) -> int:
+    return int(browser.evaluate(f"document.querySelectorAll({selector!r}).length"))
+
+
+SCREENS = [{"width": 1280}, {"width": 390, "phone": True}, {"width": 390, "phone": True, "dark": True}]
+
+
+@needs_browser
+@pytest.mark.parametrize("screen", SCREENS, ids=["desk", "phone", "dark phone"])
+def test_slider_and_scene_respond(browser: Browser, page: str, tmp_path: Path, screen: dict[str, Any]) -> None:
+    shown(browser, page, tmp_path, **screen)
+    assert browser.evaluate("innerWidth") == screen["width"]
+    assert browser.evaluate("document.documentElement.scrollWidth") <= screen["width"], "the page scrolls sideways"
+    assert browser.evaluate("document.getElementById('slider').max") == str(len(STATUSES) - 1)
+    assert verdict(browser).startswith("Slice 0, 0.dcm: ok")
+    # the keyboard alone: along the slices, then into the scene
+    browser.evaluate("document.getElementById('slider').focus()")
+    for _ in range(3):
+        browser.press("ArrowRight", 39)
+    assert verdict(browser).startswith("Slice 3, 3.dcm: no_pose (too_few_spots)")
+    assert (count(browser, "#view circle:not(.free)"), count(browser, "#view circle.free")) == (0, 2)
+    browser.press("Tab", 9)
+    browser.press("Tab", 9)
+    assert browser.evaluate("document.activeElement.id") == "scene"
+    browser.evaluate("document.getElementById('back').click()")
+    assert verdict(browser).startswith("Slice 2, 2.dcm: ok")
+    assert count(browser, "#view circle:not(.free)") == 3
+    before = drawn(browser)
+    browser.press("ArrowLeft", 37)
+    assert drawn(browser) != before
+    browser.press("0", 48, "0")
+    assert drawn(browser) == before
+    browser.press("+", 187, "+")
+    assert drawn(browser) != before
+    assert browser.console == []
+    assert [address for address in browser.requests if not address.startswith(("data:", "file:"))] == []
+
+
+@needs_browser
+def test_spots_of_no_rod_and_rods_of_no_spot_stand_where_they_are(browser: Browser, tmp_path: Path) -> None:
+    data = json.loads(document_text())
+    row, rods = data["results"][0], frame().rods
+    T = np.eye(4)
+    T[:3, 3] = [40.0, 45.0, 1.0]
+    row |= {"T_slice_model": T.tolist(), "missing_rods": [rod.id for rod in rods[3:5]]}
+    shown(browser, report_html(read(tmp_path, json.dumps(data)), model=frame()), tmp_path, width=1280)
+    rings = browser.evaluate(
+        "[...document.querySelectorAll('#view circle.free')].map(c => ['cx', 'cy'].map(k => +c.getAttribute(k)))"
     )
-    found = re.search(r'data-seen="([^"]*)"', done.stdout)
-    assert found, done.stderr[-2000:]
-    seen: dict[str, object] = json.loads(unescape(found[1]))
-    return seen, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+    np.testing.assert_allclose(rings, row["unmatched_px"], atol=1e-3)
+    crosses = browser.evaluate("[...document.querySelectorAll('#view path.unseen')].map(p => p.getAttribute('d'))")
+    assert len(crosses) == 2
+    for rod, cross in zip(rods[3:5], crosses, strict=True):
+        # where the rod meets the plane z = 0 of the slice
+        p, q = rod.start + T[:3, 3], rod.end + T[:3, 3]
+        expected = (p + p[2] / (p[2] - q[2]) * (q - p))[:2] / SCALE_MM
+        numbers = np.array(re.findall(r"-?[\d.]+(?:e-?\d+)?", cross), dtype=float).reshape(4, 2)
+        np.testing.assert_allclose(numbers.mean(axis=0), expected, atol=1e-3)
 
 
-@pytest.mark.skipif(BROWSER is None, reason="Debian package chromium is not installed")
-@pytest.mark.parametrize("width", [1200, 500])
-def test_browser_slider_and_scene(page: str, tmp_path: Path, width: int) -> None:
-    script = """
-      const slider = document.getElementById("slider"), canvas = document.getElementById("scene");
-      const verdict = () => document.getElementById("verdict").textContent;
-      const drawn = () => canvas.toDataURL();
-      seen.max = slider.max; seen.first = verdict();
-      const before = drawn();
-      canvas.focus();
-      canvas.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowLeft", bubbles: true}));
-      seen.turned = drawn() !== before;
-      document.getElementById("reset").click();
-      seen.back = drawn() === before;
-      document.querySelector("[data-zoom]").click();
-      seen.zoomed = drawn() !== before;
-      slider.value = 3; slider.dispatchEvent(new Event("input"));
-      seen.lost = verdict(); seen.circles = document.querySelectorAll("#view circle").length;
-      document.getElementById("back").click();
-      seen.stepped = verdict(); seen.rings = document.querySelectorAll("#view circle").length;
-      seen.wide = document.documentElement.scrollWidth <= innerWidth;
-    """
-    seen, console = run_in_browser(page, script, tmp_path, width)
-    assert seen["violations"] == []
-    assert seen["resources"] == []
-    assert console == ""
-    assert seen["max"] == str(len(STATUSES) - 1)
-    assert str(seen["first"]).startswith("Slice 0, 0.dcm: ok")
-    assert (seen["turned"], seen["back"], seen["zoomed"]) == (True, True, True)
-    assert str(seen["lost"]).startswith("Slice 3, 3.dcm: no_pose (too_few_spots)")
-    assert seen["circles"] == 0
-    assert str(seen["stepped"]).startswith("Slice 2, 2.dcm: ok")
-    assert seen["rings"] == 3
-    assert seen["wide"], "the page scrolls sideways"
-
-
-@pytest.mark.skipif(BROWSER is None, reason="Debian package chromium is not installed")
-def test_a_browser_would_tell_of_a_request(page: str, tmp_path: Path) -> None:
+@needs_browser
+def test_a_browser_would_tell_of_a_request(browser: Browser, page: str, tmp_path: Path) -> None:
     """The test above can fail: a picture from elsewhere is seen."""
     script = 'const i = new Image(); i.src = "https://localhost:9/x.png"; document.body.append(i);'
-    late = "setTimeout(() => document.body.setAttribute('data-seen', JSON.stringify(seen)), 200);"
-    seen, console = run_in_browser(page, script + late, tmp_path, 900)
-    assert seen["violations"] or console
+    shown(browser, page.replace("</body>", f"<script>{script}</script></body>"), tmp_path, width=900)
+    assert any("localhost:9" in said for said in browser.console + browser.requests)
+
+
+@needs_browser
+def test_on_paper_all_is_open_and_dark_on_light(browser: Browser, page: str, tmp_path: Path) -> None:
+    shown(browser, page, tmp_path, width=1280, dark=True)
+    on_screen = drawn(browser)
+    browser.evaluate("dispatchEvent(new Event('beforeprint'))")
+    on_paper = drawn(browser)
+    browser.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert count(browser, "details:not([open])") == 0
+    assert drawn(browser) == on_screen != on_paper
+    shown(browser, page, tmp_path, width=1280)
+    assert drawn(browser) == on_paper
+    assert browser.pdf().startswith(b"%PDF")
+
+
+@needs_browser
+def test_hostile_names_run_nothing(browser: Browser, tmp_path: Path) -> None:
+    shown(browser, report_html(read(tmp_path, hostile_text()), model=frame()), tmp_path, width=1280)
+    for _ in STATUSES:
+        browser.evaluate("document.getElementById('on').click()")
+    assert browser.evaluate("document.title.includes('<script>')")
+    assert browser.evaluate("window.hit === undefined")
+    assert count(browser, "img") == 0
+    assert browser.console == []

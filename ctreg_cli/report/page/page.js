@@ -17,6 +17,16 @@
     return made;
   }
 
+  function unseenIn(slice) {
+    // where the pose puts rods that no spot was matched to; a rod that ends short of the slice crosses it nowhere
+    if (!slice.T || !slice.scale) return [];
+    return data.rods.filter((rod) => slice.missing.includes(rod.id)).flatMap((rod) => {
+      const [p, q] = rod.ends.map((end) => moved(slice.T, end)), t = p[2] / (p[2] - q[2]);
+      if (!(t >= 0 && t <= 1)) return [];
+      return [{ id: rod.id, place: [0, 1].map((k) => (p[k] + t * (q[k] - p[k])) / slice.scale[k]) }];
+    });
+  }
+
   function drawView(slice) {
     view.replaceChildren();
     view.setAttribute("class", slice.status + (slice.picture ? " pictured" : ""));
@@ -26,6 +36,14 @@
     if (slice.picture)
       view.append(element("image", { href: slice.picture, x: u0, y: v0, width: side, height: side }));
     const size = side / 26, middle = [u0 + side / 2, v0 + side / 2];
+    const within = ([u, v]) => u >= u0 && u <= u0 + side && v >= v0 && v <= v0 + side;
+    const free = slice.free.filter(within), unseen = unseenIn(slice).filter(({ place }) => within(place));
+    for (const [u, v] of free) view.append(element("circle", { class: "free", cx: u, cy: v, r: size * 0.45 }));
+    for (const { id, place: [u, v] } of unseen) {
+      const r = size * 0.3;
+      view.append(element("path", { class: "unseen", d: `M${u - r} ${v - r}L${u + r} ${v + r}M${u - r} ${v + r}L${u + r} ${v - r}` }));
+      view.append(element("text", { class: "unseen", x: u, y: v - size, "font-size": size, "text-anchor": "middle", "dominant-baseline": "middle" }, id));
+    }
     for (const [rod, u, v, ru, rv] of slice.spots) {
       const away = Math.hypot(u - middle[0], v - middle[1]) || 1;
       const x = u + 1.6 * size * (u - middle[0]) / away, y = v + 1.6 * size * (v - middle[1]) / away;
@@ -33,7 +51,12 @@
       view.append(element("line", { class: "arrow", x1: u, y1: v, x2: u + RESIDUAL_ZOOM * ru, y2: v + RESIDUAL_ZOOM * rv }));
       view.append(element("text", { x, y, "font-size": size, "text-anchor": "middle", "dominant-baseline": "middle" }, rod));
     }
-    byId("magnified").textContent = slice.spots.length ? `Lines are residuals, ${RESIDUAL_ZOOM} times as long.` : "";
+    const outside = slice.free.length - free.length;
+    byId("matched-key").hidden = !slice.spots.length;
+    byId("free-key").hidden = !slice.free.length;
+    byId("unseen-key").hidden = !unseen.length;
+    byId("free-count").textContent = `${slice.free.length}${outside ? `, ${free.length ? outside : "all"} outside this view` : ""}`;
+    byId("magnified").textContent = `lines are residuals, ${RESIDUAL_ZOOM} times as long`;
   }
 
   function show(index) {
@@ -56,6 +79,7 @@
 
   // ---- 3D scene, in slice coordinates ------------------------------------------------------------------------------
   const START = { turn: -35, tilt: 62, zoom: 1 };
+  const FILLED = 0.92;
   const camera = { ...START };
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const moved = (T, p) => [0, 1, 2].map((r) => T[4 * r] * p[0] + T[4 * r + 1] * p[1] + T[4 * r + 2] * p[2] + T[4 * r + 3]);
@@ -67,26 +91,32 @@
     const rods = slice.T ? data.rods.map((rod) => ({
       id: rod.id, ends: rod.ends.map((end) => moved(slice.T, end)), matched: matched.has(rod.id), missing: slice.missing.includes(rod.id),
     })) : [];
+    const free = slice.free.map(([u, v]) => [u * s_x, v * s_y, 0]);
     const targets = slice.T ? slice.tre.map(([id, place, tre]) => ({ id, place, tre })) : [];
     let plane = [];
     if (data.view) {
       const [u0, v0, side] = data.view;
       plane = [[0, 0], [1, 0], [1, 1], [0, 1]].map(([a, b]) => [(u0 + a * side) * s_x, (v0 + b * side) * s_y, 0]);
     }
-    return { spots, rods, targets, plane };
+    return { spots, free, rods, targets, plane };
+  }
+
+  function turned(p, { turn, tilt }) {
+    // right, down and towards the eye
+    const [sinTurn, cosTurn, sinTilt, cosTilt] = [turn, tilt].flatMap((angle) => [Math.sin(angle * Math.PI / 180), Math.cos(angle * Math.PI / 180)]);
+    const right = cosTurn * p[0] - sinTurn * p[1], back = sinTurn * p[0] + cosTurn * p[1];
+    return [right, back * cosTilt - p[2] * sinTilt, back * sinTilt + p[2] * cosTilt];
   }
 
   function extent() {
-    // the same for all slices, so that nothing jumps while sliding
-    const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-    for (const slice of slices) {
-      const scene = sceneOf(slice);
-      const points = [...scene.plane, ...scene.rods.flatMap((rod) => rod.ends)];
-      for (const p of points) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], p[k]); high[k] = Math.max(high[k], p[k]); }
-    }
-    if (!isFinite(low[0])) return { middle: [0, 0, 0], radius: 1 };
-    const middle = low.map((value, k) => (value + high[k]) / 2);
-    return { middle, radius: Math.hypot(...low.map((value, k) => (high[k] - value) / 2)) || 1 };
+    // the same for all slices, so that nothing jumps while sliding; all is in view as the scene is first seen
+    const points = slices.map(sceneOf).flatMap((scene) => [...scene.plane, ...scene.rods.flatMap((rod) => rod.ends), ...scene.targets.map((target) => target.place)]);
+    if (!points.length) return { middle: [0, 0, 0], radius: 1 };
+    const span = (places, k) => places.reduce(([low, high], p) => [Math.min(low, p[k]), Math.max(high, p[k])], [Infinity, -Infinity]);
+    const middle = [0, 1, 2].map((k) => { const [low, high] = span(points, k); return (low + high) / 2; });
+    const seen = points.map((p) => turned(p.map((value, k) => value - middle[k]), START));
+    const reach = [0, 1].flatMap((k) => span(seen, k).map(Math.abs));
+    return { middle, radius: Math.max(...reach) || 1 };
   }
   const { middle, radius } = extent();
 
@@ -98,12 +128,10 @@
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, box.width, box.height);
     if (!slices.length) return;
-    const turn = camera.turn * Math.PI / 180, tilt = camera.tilt * Math.PI / 180;
-    const scale = 0.56 * Math.min(box.width, box.height) / radius * camera.zoom;
+    const scale = FILLED * Math.min(box.width, box.height) / 2 / radius * camera.zoom;
     const project = (p) => {
-      const x = p[0] - middle[0], y = p[1] - middle[1], z = p[2] - middle[2];
-      const a = Math.cos(turn) * x - Math.sin(turn) * y, b = Math.sin(turn) * x + Math.cos(turn) * y;
-      return { x: box.width / 2 + scale * a, y: box.height / 2 + scale * (b * Math.cos(tilt) - z * Math.sin(tilt)), depth: b * Math.sin(tilt) + z * Math.cos(tilt) };
+      const [right, down, depth] = turned(p.map((value, k) => value - middle[k]), camera);
+      return { x: box.width / 2 + scale * right, y: box.height / 2 + scale * down, depth };
     };
     const scene = sceneOf(slices[at]);
     const ink = colour("ink"), soft = colour("soft");
@@ -114,6 +142,12 @@
       const a = project(p), b = project(q);
       g.strokeStyle = stroke; g.lineWidth = thick; g.setLineDash(dash || []);
       g.beginPath(); g.moveTo(a.x, a.y); g.lineTo(b.x, b.y); g.stroke(); g.setLineDash([]);
+    };
+    // words with a halo, so that rods behind them do not cross them out; those near the right edge stand left of it
+    const write = (text, x, y, fill) => {
+      const place = Math.max(2, Math.min(x, box.width - g.measureText(text).width - 4));
+      g.strokeStyle = colour("panel"); g.lineWidth = 4; g.lineJoin = "round"; g.strokeText(text, place, y);
+      g.fillStyle = fill; g.fillText(text, place, y);
     };
     const dot = (p, size, fill) => { const a = project(p); g.fillStyle = fill; g.beginPath(); g.arc(a.x, a.y, size, 0, 7); g.fill(); return a; };
     const drawPlane = () => {
@@ -138,29 +172,33 @@
     halves.filter((half) => half.side * facing >= 0).forEach(drawHalf);
     for (const { id, ends: [p, q] } of scene.rods) {
       const a = project(p.map((value, k) => value + LABEL_AT * (q[k] - value)));  // ends of rods often meet, these do not
-      g.fillStyle = soft;
-      g.fillText(id, a.x + 6, a.y + 4);
+      write(id, a.x + 6, a.y + 4, soft);
+    }
+    for (const place of scene.free) {
+      const a = project(place);
+      if (a.x < 0 || a.y < 0 || a.x > box.width || a.y > box.height) continue;
+      g.strokeStyle = colour("free"); g.lineWidth = 2; g.beginPath(); g.arc(a.x, a.y, 4, 0, 7); g.stroke();
     }
     for (const spot of scene.spots) dot(spot.place, 4.5, mark);
     for (const target of scene.targets) {
       const a = project(target.place);
       g.strokeStyle = ink; g.lineWidth = 2; g.beginPath();
       g.moveTo(a.x - 6, a.y); g.lineTo(a.x + 6, a.y); g.moveTo(a.x, a.y - 6); g.lineTo(a.x, a.y + 6); g.stroke();
-      g.fillStyle = ink; g.fillText(`${target.id} ± ${target.tre.toPrecision(2)} mm`, a.x + 9, a.y + 14);
+      write(`${target.id} ± ${target.tre.toPrecision(2)} mm`, a.x + 9, a.y + 14, ink);
     }
-    drawAxes(g, project, line);
+    drawAxes(project, line, write);
     if (!slices[at].T) { g.fillStyle = mark; g.fillText("no pose in this slice", 12, 22); }
     else if (!data.rods.length) { g.fillStyle = soft; g.fillText("the frame was not given: no rods", 12, 22); }
   }
 
-  function drawAxes(g, project, line) {
+  function drawAxes(project, line, write) {
     const length = 0.18 * radius, origin = data.view && slices[at].scale
       ? [data.view[0] * slices[at].scale[0], data.view[1] * slices[at].scale[1], 0] : middle;
     [["x", 0], ["y", 1], ["z", 2]].forEach(([name, k]) => {
       const tip = origin.map((value, j) => value + (j === k ? length : 0));
       line(origin, tip, colour("soft"), 1.5);
       const a = project(tip);
-      g.fillStyle = colour("soft"); g.fillText(name, a.x + 3, a.y + 3);
+      write(name, a.x + 3, a.y + 3, colour("soft"));
     });
   }
 
@@ -170,6 +208,7 @@
     drawScene();
   }
   function zoomBy(factor) { camera.zoom = Math.max(0.3, Math.min(12, camera.zoom * factor)); drawScene(); }
+  function onPaper(is) { document.documentElement.classList.toggle("paper", is); drawScene(); }
   function reset() { Object.assign(camera, START); drawScene(); }
 
   // ---- hands ---------------------------------------------------------------------------------------------------------
@@ -219,6 +258,10 @@
   }, { passive: false });
   window.addEventListener("resize", drawScene);
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawScene);
-  window.addEventListener("beforeprint", () => { for (const part of document.querySelectorAll("details")) part.open = true; drawScene(); });
+  window.addEventListener("beforeprint", () => {
+    for (const part of document.querySelectorAll("details")) part.open = true;
+    onPaper(true);
+  });
+  window.addEventListener("afterprint", () => onPaper(false));
   show(Math.max(0, slices.findIndex((slice) => slice.status === "ok")));
 })();
