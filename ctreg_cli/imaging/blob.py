@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
-from ctreg_cli.imaging.maxima import local_maxima, smoothed
+from ctreg_cli.imaging.maxima import ascents, smoothed
 from ctreg_cli.imaging.window import UprightImage, dilated, grid, nan_quantile, ring
 
 #: share of the ring that neighbours, plate edges and streaks may brighten without lifting the background
@@ -22,11 +22,9 @@ BACKGROUND_PX = 4.0
 RECENTRINGS = 3
 #: a blob's peak lies within this of its window's middle, px
 CORE_PX = 2.0
-#: beyond so many half widths of a lone blob nothing stands out by more than so many spreads of the ring, which no noise
-#: does; but by a tenth of its height in any case (what is fainter is no rod beside it), by a fifth in none
-SKIRT, LONE_SPREADS, LONE_SHARES = 2.2, 7.0, (0.1, 0.2)
-#: its peak is looked for away from the window's edge, px
-INNER_PX = 2
+#: beside a lone blob nothing stands out by more than so many spreads of the ring, which no noise does; but by a tenth
+#: of its height in any case (what is fainter is no rod beside it), by a fifth in none
+LONE_SPREADS, LONE_SHARES = 7.0, (0.1, 0.2)
 #: a pixel is 1/12 px² wide in second moments
 _PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -78,9 +76,7 @@ class Blobs:
     @property
     def cut_off(self) -> BoolArray:
         """(k,) whether the blob leaves too little background about it: the window is too small."""
-        u, v = grid(self.radius)
-        outer = np.hypot(u, v) > self.radius - BACKGROUND_PX
-        return np.asarray((self.own & outer).any(axis=(1, 2)))
+        return np.asarray(self.own.reshape(len(self), -1)[:, _outer(self.radius)].any(axis=1))
 
     @property
     def at_border(self) -> BoolArray:
@@ -126,25 +122,26 @@ def measure_blobs(image: UprightImage, peaks: IntArray, radius: int) -> Blobs:
     return blobs
 
 
-def measure_lone_blobs(image: UprightImage, peaks: IntArray, radius: int) -> tuple[Blobs, BoolArray]:
-    """The blobs at ``peaks`` (k, 2) where nothing is beside them, and where (k,) that is so.
+def measure_lone_blobs(image: UprightImage, middles: IntArray, radius: int) -> tuple[Blobs, BoolArray]:
+    """The blobs at ``middles`` (k, 2) where nothing is beside them, and where (k,) that is so.
 
     Those are what :func:`measure_blobs` finds, but for the search of what hangs together: of a lone blob all that is
     bright is its own. Elsewhere the numbers mean nothing.
     """
-    blobs = _measure_lone(image, peaks, radius)
-    moved = np.flatnonzero((np.abs(blobs.centre) > 0.5).any(axis=1))
-    if len(moved):
-        middles = np.rint(blobs.uv_px[moved]).astype(np.intp)
-        blobs = blobs.replaced(moved, _measure_lone(image, middles, radius))
-    return blobs, _is_lone(blobs)
+    blobs, edge = _measure_lone(image, middles, radius)
+    centred = np.rint(blobs.uv_px).astype(np.intp)
+    if (centred != middles).any():
+        blobs, edge = _measure_lone(image, centred, radius)
+    return blobs, _is_lone(blobs, edge)
 
 
-def _measure_lone(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
+def _measure_lone(image: UprightImage, middles: IntArray, radius: int) -> tuple[Blobs, FloatArray]:
+    """Blobs, and the sorted values (k, p) of the rings about them."""
     values = image.windows(middles, radius)
-    k = len(values)
-    background = nan_quantile(values.reshape(k, -1)[:, ring(radius)], BACKGROUND_QUANTILE)
-    height = values.reshape(k, -1)[:, _core(radius)].max(axis=1) - background
+    flat = values.reshape(len(values), -1)
+    edge = np.sort(flat[:, ring(radius)], axis=1)
+    background = edge[:, round(BACKGROUND_QUANTILE * (edge.shape[1] - 1))]
+    height = flat[:, _core(radius)].max(axis=1) - background
     own = values > (background + 0.5 * height)[:, None, None]
     centre, moments = _moments(own, radius)
     return Blobs(
@@ -157,26 +154,21 @@ def _measure_lone(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         foreign=np.zeros_like(own),
         centre=centre,
         moments=moments,
-    )
+    ), edge
 
 
-def _is_lone(blobs: Blobs) -> BoolArray:
-    """Whether (k,) a window holds one peak, apart from its edge and far above all that is not close to it."""
-    k, radius = len(blobs), blobs.radius
-    u, v = grid(radius)
-    x, y = u - blobs.centre[:, 0, None, None], v - blobs.centre[:, 1, None, None]
-    uu, uv, vv = inverse_elements(blobs.moments)
-    # a uniform ellipse has moments of a quarter of its semi-axes squared
-    reach = uu[:, None, None] * x * x + vv[:, None, None] * y * y + 2.0 * uv[:, None, None] * x * y > 4.0 * SKIRT**2
-    beside = np.where(reach, blobs.values, -np.inf).reshape(k, -1).max(axis=1)
-    spread = _spread(blobs.values.reshape(k, -1)[:, ring(radius)], blobs.background)
+def _is_lone(blobs: Blobs, edge: FloatArray) -> BoolArray:
+    """Whether (k,) a window holds one peak in its middle, and no more than its background at its ``edge``."""
+    k, n = len(blobs), 2 * blobs.radius + 1
     low, high = (share * blobs.height for share in LONE_SHARES)
-    highest = blobs.background + np.clip(LONE_SPREADS * spread, low, high)
-    lone = np.isfinite(blobs.values.sum(axis=(1, 2))) & (np.abs(blobs.centre) <= 0.5).all(axis=1) & ~blobs.cut_off
-    lone &= beside < highest
-    inner = smoothed(blobs.values[:, INNER_PX:-INNER_PX, INNER_PX:-INNER_PX])
-    peaks = local_maxima(inner) & (inner > highest[:, None, None])
-    lone &= np.count_nonzero(peaks, axis=(1, 2)) == 1
+    spread = 0.5 * (blobs.background - edge[:, round((1.0 - BACKGROUND_QUANTILE) * (edge.shape[1] - 1))])
+    most = blobs.background + np.minimum(np.maximum(LONE_SPREADS * spread, low), high)
+    # NaN go last when sorted, and compare as false
+    lone = (edge[:, -1] < most) & (np.maximum(*np.abs(blobs.centre.T)) <= 0.5) & ~blobs.cut_off
+    smooth = smoothed(blobs.values)
+    smooth[:, [0, -1]] = smooth[:, :, [0, -1]] = -np.inf
+    peaks = ascents(smooth.ravel(), np.flatnonzero(smooth > most[:, None, None]), n)
+    lone &= np.bincount(peaks // (n * n), minlength=k) == 1
     return np.asarray(lone)
 
 
@@ -211,6 +203,12 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
 
 
 @cache
+def _outer(radius: int) -> IntArray:
+    """Flat indices of the pixels of a window in which no blob may lie."""
+    return frozen_index(np.flatnonzero(np.hypot(*grid(radius)) > radius - BACKGROUND_PX))
+
+
+@cache
 def _core(radius: int) -> IntArray:
     """Flat indices of the pixels about the middle of a window in which its blob's peak lies."""
     return frozen_index(np.flatnonzero(np.hypot(*grid(radius)) < CORE_PX))
@@ -218,21 +216,19 @@ def _core(radius: int) -> IntArray:
 
 def _moments(own: BoolArray, radius: int) -> tuple[FloatArray, FloatArray]:
     """Centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, n, n), px."""
-    flat = own.reshape(len(own), -1).astype(np.float64)
-    count, mean_u, mean_v, uu, uv, vv = _monomials(radius) @ flat.T
-    count = np.maximum(count, 1.0)
-    centre = np.stack([mean_u, mean_v], axis=1) / count[:, None]
-    moments = np.stack([uu, uv, uv, vv], axis=1).reshape(-1, 2, 2) / count[:, None, None]
-    moments -= centre[:, :, None] * centre[:, None]
-    moments[:, [0, 1], [0, 1]] += _PIXEL_VARIANCE
+    sums = own.reshape(len(own), -1).astype(np.float64) @ _monomials(radius)
+    sums /= np.maximum(sums[:, :1], 1.0)
+    centre = sums[:, 1:3].copy()
+    moments = sums[:, 3:].reshape(-1, 2, 2) - centre[:, :, None] * centre[:, None]
+    moments += _PIXEL_VARIANCE * np.eye(2)
     return centre, moments
 
 
 @cache
 def _monomials(radius: int) -> FloatArray:
-    """(6, n²): 1, u, v, u², uv, v² at the pixels of a window."""
+    """(n², 7): 1; u, v; u², uv, uv, v² at the pixels of a window."""
     u, v = (axis.ravel() for axis in grid(radius))
-    return frozen(np.stack([np.ones(u.size), u, v, u * u, u * v, v * v]), (6, u.size))
+    return frozen(np.stack([np.ones(u.size), u, v, u * u, u * v, u * v, v * v], axis=1), (u.size, 7))
 
 
 def inverse_elements(symmetric: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -27,6 +27,7 @@ def _per_parameter(*, centre: float, log_height: float, background: float, shape
 #: flat the top is hardly differs from spot to spot (tried on simulated CT: looser is worse); a trace of certainty about
 #: the rest keeps the matrix regular where a window is all padding
 PRIOR = _per_parameter(centre=1e-9, log_height=0.7**-2, background=1e-9, shape=0.7**-2, log_beta=0.1**-2)
+_PRIOR_MATRIX, _UNIT_MATRIX = np.diag(PRIOR[:, 0]), np.eye(N_PARAMETERS)
 #: farthest from the start (10, 1): px for the centre, a factor of eight for height and shape
 MAX_CHANGE = _per_parameter(centre=2.0, log_height=2.0, background=np.inf, shape=2.0, log_beta=np.inf)
 
@@ -55,44 +56,44 @@ def _steps(
     low[LOG_BETA], high[LOG_BETA] = LOG_BETA_RANGE
     unit = np.ones_like(start)
     unit[7] = np.exp(-start[6])  # a step in l1 is measured in the spot's own coordinates, as all others are
-    diagonal = np.arange(N_PARAMETERS)
 
-    deviation = (parameters - start) * unit
+    def deviation_and_cost(parameters: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        deviation = (parameters - start) * unit
+        return PRIOR * deviation, products[:, -1, -1] + np.einsum("ik,ik->k", PRIOR * deviation, deviation)
+
     products = rows.evaluate(parameters)
-    cost = products[:, -1, -1] + (PRIOR * deviation * deviation).sum(axis=0)
+    pull, cost = deviation_and_cost(parameters, products)
     k = start.shape[1]
     damping, done, stale = np.full(k, FIRST_DAMPING), np.zeros(k, dtype=bool), False
     for _ in range(most):
-        damped = products[:, :-1, :-1].copy()
-        damped[:, diagonal, diagonal] += PRIOR.T
-        damped[:, diagonal, diagonal] *= (1.0 + damping)[:, None]
-        gradient = products[:, :-1, -1] - (PRIOR * deviation).T
+        damped = products[:, :-1, :-1] + _PRIOR_MATRIX
+        damped *= 1.0 + damping[:, None, None] * _UNIT_MATRIX
+        gradient = products[:, :-1, -1] - pull.T
         step = np.asarray(np.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T, dtype=np.float64)
-        step[:, done] = 0.0
-        trial: FloatArray = np.clip(moved(parameters, step), low, high)
-        small = np.abs(trial[:2] - parameters[:2]).max(axis=0) < DONE_PX
-        small |= (gradient.T * step).sum(axis=0) < DONE_SD2
+        if done.any():
+            step[:, done] = 0.0
+        trial = np.minimum(np.maximum(moved(parameters, step), low), high)
+        change = trial[CENTRE] - parameters[CENTRE]
+        small = np.maximum(np.abs(change[0]), np.abs(change[1])) < DONE_PX
+        small |= np.einsum("ki,ik->k", gradient, step) < DONE_SD2
         small &= damping <= DONE_DAMPING
-        if small.all() and not stale:
+        if not stale and small.all():
             parameters, done = trial, small
             rows.by_spot[:, -1] -= (step.T[:, None] @ rows.by_spot[:, :-1])[:, 0]
             break
         trial_products = rows.evaluate(trial)
-        trial_deviation = (trial - start) * unit
-        trial_cost = trial_products[:, -1, -1] + (PRIOR * trial_deviation * trial_deviation).sum(axis=0)
+        trial_pull, trial_cost = deviation_and_cost(trial, trial_products)
         better = trial_cost <= cost
         done |= better & small
         stale = not better.all()
         if stale:
             damping *= np.where(better, 1.0 / DAMPING_FACTOR, DAMPING_FACTOR)
-            parameters, deviation = np.where(better, trial, parameters), np.where(better, trial_deviation, deviation)
+            parameters, pull = np.where(better, trial, parameters), np.where(better, trial_pull, pull)
             products = np.where(better[:, None, None], trial_products, products)
             cost = np.where(better, trial_cost, cost)
         else:
             damping /= DAMPING_FACTOR
-            parameters, deviation, products, cost = trial, trial_deviation, trial_products, trial_cost
+            parameters, pull, products, cost = trial, trial_pull, trial_products, trial_cost
     if stale:
         products = rows.evaluate(parameters)
-    normal = products[:, :-1, :-1].copy()
-    normal[:, diagonal, diagonal] += PRIOR[:, 0]
-    return parameters, normal, done
+    return parameters, products[:, :-1, :-1] + _PRIOR_MATRIX, done

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ctreg_cli.arrays import BoolArray
+from ctreg_cli.arrays import BoolArray, IntArray
 
 
 def smoothed(image: NDArray[Any]) -> NDArray[Any]:
@@ -22,6 +22,16 @@ def smoothed(image: NDArray[Any]) -> NDArray[Any]:
     inner *= 1 / 16
     out[..., 1:-1, 1:-1] = inner
     return out
+
+
+def ascents(flat: NDArray[Any], at: IntArray, columns: int) -> IntArray:
+    """Those of the pixels ``at`` of a flattened image that are not lower than their 8 neighbours.
+
+    Of a flat top only the first in reading order; none of ``at`` may lie on the border.
+    """
+    for step in (1, columns, columns + 1, columns - 1):
+        at = at[(flat[at] > flat[at - step]) & (flat[at] >= flat[at + step])]
+    return at
 
 
 def local_maxima(smooth: NDArray[Any]) -> BoolArray:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import BACKGROUND_QUANTILE
+from ctreg_cli.imaging.maxima import ascents
 from ctreg_cli.imaging.window import UprightImage, nan_quantile
 
 #: side of the blocks whose least value is the first, generous background, px
@@ -51,11 +52,7 @@ def maxima_above(smooth: NDArray[Any], margin: float) -> tuple[IntArray, IntArra
     limit = blocks.min(axis=1).min(axis=2) + smooth.dtype.type(margin)
     above = (blocks > limit[:, None, :, None]).reshape(padded.shape)[:rows, :columns]
     above[[0, -1]] = above[:, [0, -1]] = False
-    at = np.flatnonzero(above)
-    flat = smooth.ravel()
-    for step in (1, columns, columns + 1, columns - 1):
-        at = at[(flat[at] > flat[at - step]) & (flat[at] >= flat[at + step])]
-    return np.divmod(at, columns)
+    return np.divmod(ascents(smooth.ravel(), np.flatnonzero(above), columns), columns)
 
 
 def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_half_width: float) -> Peaks:

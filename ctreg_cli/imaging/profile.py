@@ -36,10 +36,12 @@ def moved(parameters: FloatArray, step: FloatArray) -> FloatArray:
     Its first two rows shift the contours by −L δc; rows 6 to 8 stretch them, ``δξ = e0 ξ``, ``δη = e1 ξ + e2 η``; the
     others are added.
     """
-    l0, l1, _ = parameters[SHAPE]
-    after = parameters + step
-    after[:2] = parameters[:2] + in_pixels(parameters, step[:2])
-    after[7] = l1 + step[7] * np.exp(l0) + l1 * step[8]
+    after: FloatArray = parameters + step
+    scale_u, scale_v, l1 = np.exp(parameters[6]), np.exp(parameters[8]), parameters[7]
+    du = -step[0] / scale_u
+    after[0] = parameters[0] + du
+    after[1] = parameters[1] - (step[1] + l1 * du) / scale_v
+    after[7] = l1 + step[7] * scale_u + l1 * step[8]
     return after
 
 

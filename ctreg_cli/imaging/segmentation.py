@@ -48,6 +48,8 @@ class SegmentationOptions:
 
 DEFAULT_OPTIONS = SegmentationOptions()
 
+#: share of a window's range that the top of its spot stands for
+BRIGHTEST = 0.25
 #: radii of the windows tried, px, until a spot fits with background about it
 WINDOW_RADII_PX = (8, 12, 18, 26)
 #: without a known rod diameter a spot is at most so thick: in mm, or where there is no scale as a share of the image
@@ -156,14 +158,26 @@ def _lone_blobs(image: UprightImage, uv: FloatArray, radius: FloatArray, limits:
     off_u, off_v = u + (middles - uv)[:, 0, None, None], v + (middles - uv)[:, 1, None, None]
     within = off_u * off_u + off_v * off_v <= (radius * radius)[:, None, None]
     windows = np.where(within, image.windows(middles, reach), -np.inf)
-    rows, columns = np.divmod(windows.reshape(len(uv), -1).argmax(axis=1), 2 * reach + 1)
-    blobs, lone = measure_lone_blobs(image, middles + np.stack([columns, rows], axis=1) - reach, WINDOW_RADII_PX[0])
+    blobs, lone = measure_lone_blobs(image, middles + _brightest_place(windows), WINDOW_RADII_PX[0])
     major, minor, _ = blobs.axes
     lone &= (minor <= limits.width_px) & (major <= limits.length_px)
     lone &= np.hypot(*(blobs.uv_px - uv).T) + radius <= blobs.radius  # so that its window shows all that was looked at
     between = np.hypot(*(blobs.uv_px[:, None] - blobs.uv_px).transpose(2, 0, 1))
     lone &= np.count_nonzero(between <= blobs.radius, axis=1) == 1
     return (blobs if lone.all() else blobs.take(lone)), lone
+
+
+def _brightest_place(windows: FloatArray) -> IntArray:
+    """Offset (k, 2), px, from the middle of each window (k, n, n) to that of the brightest quarter of its range."""
+    k, n, _ = windows.shape
+    flat = windows.reshape(k, -1)
+    top = flat.max(axis=1)
+    least = np.where(np.isfinite(flat), flat, np.inf).min(axis=1)
+    bright = (flat >= (top - BRIGHTEST * (top - least))[:, None]).astype(np.float64)
+    u, v = (axis.ravel() for axis in grid(n // 2))
+    sums = bright @ np.stack([u, v, np.ones(n * n)], axis=1)
+    offset: IntArray = np.rint(sums[:, :2] / np.maximum(sums[:, 2:], 1.0)).astype(np.intp)
+    return offset
 
 
 def _peaks_about(image: UprightImage, uv: FloatArray, radius: FloatArray, limits: _Limits) -> Peaks:
@@ -280,7 +294,7 @@ def _choose(groups: Sequence[Blobs], options: SegmentationOptions, rejections: _
     """Which blobs of all groups (in their order) become spots: the best, each blob once."""
     uv = np.concatenate([group.uv_px for group in groups])
     height = np.concatenate([group.height for group in groups])
-    major, minor = (np.concatenate([group.axes[i] for group in groups]) for i in (0, 1))
+    major, minor, _ = _axes(groups)
     order = np.argsort(-_score(height, major, minor), kind="stable")
     order = order[_apart(uv[order], minor[order])]
     faint = height[order] < options.min_relative_contrast * height[order[0]]
@@ -290,6 +304,11 @@ def _choose(groups: Sequence[Blobs], options: SegmentationOptions, rejections: _
     chosen = np.zeros(len(uv), dtype=bool)
     chosen[order[~faint & ~beyond]] = True
     return chosen
+
+
+def _axes(groups: Sequence[Blobs]) -> FloatArray:
+    """Long and short axis, px, and angle, rad, (3, k) of the blobs of all groups."""
+    return np.concatenate([np.stack(group.axes) for group in groups], axis=1)
 
 
 def _score(height: FloatArray, major: FloatArray, minor: FloatArray) -> FloatArray:
@@ -314,7 +333,7 @@ def _as_spots(
     rejections: _Rejections,
 ) -> Spots:
     """Blobs and their fitted centres as spots, best first, without those that the noise about them could have made."""
-    major, minor, angle = (np.concatenate([part.axes[i] for part in blobs]) for i in range(3))
+    major, minor, angle = _axes(blobs)
     height = np.concatenate([part.height for part in blobs])
     noise = np.concatenate([part.noise for part in centres])
     uv = np.concatenate([part.uv_px for part in centres])

@@ -91,7 +91,7 @@ def noise_field(residuals: FloatArray, quiet: BoolArray, radius: int) -> tuple[F
     median = sample[np.arange(k), :, np.maximum(count[:, 0] - 1, 0) // 2]
     fine, coarse = np.maximum(MAD_TO_SD * np.where(count > 0, median, 0.0), ROUNDING_SD).T
     fine_gain, coarse_gain = _laplacian_gains()
-    length = float(np.interp(np.median(coarse / fine), coarse_gain / fine_gain, NOISE_LENGTHS_PX))
+    length = float(np.interp(np.sort(coarse / fine)[(k - 1) // 2], coarse_gain / fine_gain, NOISE_LENGTHS_PX))
     return fine, fine / np.interp(length, NOISE_LENGTHS_PX, fine_gain), length
 
 
