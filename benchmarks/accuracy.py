@@ -157,13 +157,51 @@ def fitted(
     return Rotation.from_rotvec(x[3:]).as_matrix() @ R, t + x[:3]
 
 
+def _settled(
+    frame: OracleFrame, world: OracleScene, R: np.ndarray, t: np.ndarray, rods: list[int], spots: list[int]
+) -> bool:
+    """Whether the spots, with their labels known, exclude at 100 : 1 every pose that would be called wrong.
+
+    Where the least squares is not linear it can have a valley that leads from the truth to poses many sd of the bound
+    away at next to no cost: no estimator can choose among them.
+    """
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    if is_wrong(T, frame, world):
+        return False
+    centre = world.R @ (frame.starts + frame.ends).mean(axis=0) / 2
+    G = np.hstack([np.eye(3), -np.cross(np.eye(3), centre)])
+    unit = np.array([1, 1, 1, 0.03, 0.03, 0.03])
+    axes = np.linalg.eigh(world.bound / np.outer(unit, unit))[1] * unit[:, None]
+    sd_turn, sd_place = bound_sds(frame, world)
+    weak = axes[:, -1]
+    step = WRONG_SD * min(sd_turn / np.linalg.norm(weak[3:]), sd_place / np.linalg.norm(G @ weak))
+
+    def residual(twist: np.ndarray, R0: np.ndarray, t0: np.ndarray) -> np.ndarray:
+        R1 = Rotation.from_rotvec(twist[3:]).as_matrix() @ R0
+        predicted = [cross_line(frame.starts[i], frame.ends[i], R1, t0 + twist[:3]) / world.mm_per_px for i in rods]
+        return (world.uv_px[spots] - predicted).ravel() / world.sd_px
+
+    least = (residual(np.zeros(6), R, t) ** 2).sum()
+    for sign in (1, -1):
+        there = least_squares(
+            lambda y, sign=sign: residual(sign * step * weak + axes[:, :-1] @ y, world.R, world.t), np.zeros(5)
+        )
+        if 2 * there.cost < least + 2 * DECIDABLE:
+            return False
+    return True
+
+
 def is_decidable(frame: OracleFrame, world: OracleScene, model: RodModel) -> bool:
-    """Whether the oracle's odds of the truth over chance, and over any other pose the search can think of, exceed 100 : 1."""
+    """Whether the oracle's odds of the truth over chance, and over any other pose, exceed 100 : 1.
+
+    Other poses are those the search can think of, and those along the valley of the truth's own least squares.
+    """
     rods = [int(r) for r in world.rod_of_spot if r >= 0]
     spots = [s for s, r in enumerate(world.rod_of_spot) if r >= 0]
     R, t = fitted(frame, world, world.R, world.t, rods, spots)
     truth = oracle_log_odds(frame, world, R, t, rods, spots)
-    if truth < DECIDABLE:
+    if truth < DECIDABLE or not _settled(frame, world, R, t, rods, spots):
         return False
     own = bound(frame, rods, R, t, world.mm_per_px, world.sd_px)
     place = make_scene(

@@ -63,6 +63,8 @@ _RIVALS_WITHIN = 7.5
 _DOUBT_WITHIN = 7.0
 #: rod triples of a match whose roots it is refined from anew, to find its second minima
 _RESTARTS = 20
+#: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
+_VERIFY_STEPS = (12, 6)
 #: spot triples examined at once: as many as stay in the processor's cache
 _CHUNK = 12_000
 #: so many spot triples of one rod triple are worth a call of their own
@@ -416,7 +418,7 @@ def _vote(
     information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + np.diag([size**-2.0] * 3 + [1.0] * 3)
     JC = (J.reshape(b, -1, 6) @ np.linalg.inv(information)).reshape(J.shape)
     gate = JC @ np.swapaxes(J, -1, -2) + tolerance[row, others] + np.median(scene.covariance_mm, axis=0)
-    r = scene.xy_mm[nearest] - np.nan_to_num(projection.xy_mm[row, others], nan=1e9)
+    r = np.where(hopeful[..., None], scene.xy_mm[nearest] - projection.xy_mm[row, others], 0)
     det = np.maximum(gate[..., 0, 0] * gate[..., 1, 1] - gate[..., 0, 1] ** 2, 1e-300)
     distance2 = (
         gate[..., 1, 1] * r[..., 0] ** 2 - 2 * gate[..., 0, 1] * r[..., 0] * r[..., 1] + gate[..., 0, 0] * r[..., 1] ** 2
@@ -431,9 +433,16 @@ def _vote(
     top = np.nonzero(enough)[0]
     top = top[np.argsort(-score[top], kind="stable")[: 4 * _KEEP_PER_STAGE]]
     spot_of_rod = np.full((len(top), n), -1, dtype=np.intp)
-    np.put_along_axis(spot_of_rod, others[top], np.where(votes[top], nearest[top], -1), axis=1)
+    one_each = np.where(votes[top], _keep_nearest(nearest[top], np.where(votes[top], distance2[top], np.inf)), -1)
+    np.put_along_axis(spot_of_rod, others[top], one_each, axis=1)
     np.put_along_axis(spot_of_rod, rods[top], spots[top], axis=1)
     return score[top], T[top], spot_of_rod
+
+
+def _keep_nearest(spot: IntArray, distance2: FloatArray) -> IntArray:
+    """Spots (b, k) chosen by each rod, −1 where another rod that chose the same one lies nearer."""
+    rival = (spot[:, :, None] == spot[:, None]) & (distance2[:, None] < distance2[:, :, None])
+    return np.where(rival.any(axis=2), -1, spot)
 
 
 def _nearest_spots(spots_mm: FloatArray, crossings_mm: FloatArray, taken: IntArray) -> tuple[IntArray, FloatArray]:
@@ -475,8 +484,10 @@ def visibility(
 
 def verify(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int) -> Matches | None:
     """Refine hypotheses on their spots, let all spots vote again with the smaller covariance, refine, weigh."""
-    for _ in range(2):
-        T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=4, step_tolerance=1e-3)
+    for iterations in _VERIFY_STEPS:
+        T, fit, _ = refine(
+            model, T, observations(scene, spot_of_rod), iterations=iterations, step_tolerance=1e-3
+        )
         spot_of_rod = assign(model, scene, T, fit)
         enough = ((spot_of_rod >= 0).sum(axis=1) >= least_matches) & np.isfinite(fit.chi2)
         T, spot_of_rod = T[enough], spot_of_rod[enough]
@@ -495,7 +506,7 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
     """Refine hypotheses with the matches they have, and give each its odds."""
     if len(T) == 0:
         return None
-    T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=10, step_tolerance=1e-5)
+    T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=25, step_tolerance=1e-5)
     projection = project(T, model.starts, model.directions)
     may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     matched = spot_of_rod >= 0

@@ -37,7 +37,7 @@ ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 #: a rival within these odds of the best makes the slice ambiguous (contract §5)
 RIVAL_ODDS = 100.0
 #: ln odds within which a rival counts that is the best match without one of its spots, where spots are false
-_FRAGILE_LOG_ODDS = 6.5
+_FRAGILE_LOG_ODDS = 5.3
 #: ... when its pose is farther off than this many standard deviations (contract §5)
 RIVAL_SD = 6.0
 #: a fit with a smaller χ² probability is refused
@@ -53,8 +53,9 @@ _WORTH_SAYING = 1e-3
 #: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
 #: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
-#: χ² that three sd must cost at the least (a straight cost: 9); under it no ellipsoid describes what is known
-_LEAST_RISE = 4.0
+#: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is; widened otherwise, but no
+#: more than so many times; and how far, in sd², the valley may bend on the way
+_STRAIGHT_RISE, _MOST_WIDENED, _PROFILE_POINTS, _STRAIGHT_BEND2 = 5.4, 1.6, 5, 9.0
 #: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
 _LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
 #: matches below which nothing can be checked: three spots always fit
@@ -224,9 +225,9 @@ def decide(
         return Registration(
             status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
         )
-    if factor > 1:
+    if widened is not best:
         best = widened
-        warnings.append(("curved_cost", f"the cost is flatter than its curvature says; sd widened {factor:.2f} times"))
+        warnings.append(("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times"))
     best, share = averaged(best, doubts)
     if share > _WORTH_SAYING:
         warnings.append(
@@ -396,7 +397,7 @@ def _hangs_on_one_spot(best: Candidate, c: Candidate) -> bool:
     """Whether ``c`` is ``best`` without one spot, at a pose that contradicts it.
 
     Where spots are false, one of them can complete a wrong pose out of true ones, at odds no density of clutter
-    foresees (one in some thousand scenes measured): a pose that a single spot decides needs more than 100 : 1.
+    foresees: a pose that a single spot decides needs 200 : 1.
     """
     one_less = len(c.rod_index) == len(best.rod_index) - 1 and _matches(c) < _matches(best)
     return one_less and not _knows_less(c, best) and pose_distance_sd(best, c) > RIVAL_SD
@@ -471,37 +472,63 @@ def widen_where_curved(
 ) -> tuple[Candidate | None, float]:
     """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
 
-    Returns the candidate and the factor (1 when all is well), or None when a step of 3 sd costs too little: then no
-    ellipsoid describes what is known.
+    Where it rises less, or its valley bends out of the ellipsoid, the profile is followed outward until it has risen by
+    the 9 that three sd must cost, and the covariance is made to reach both ends.
+
+    Returns the candidate and the factor (1 when all is well), or None where no ellipsoid describes what is known: the
+    profile stays flat for more than :data:`_MOST_WIDENED` times the sd, or the truth may lie where the spots say so much
+    more that this pose would be wrong by :data:`RIVAL_SD` of its standard deviations.
     """
     unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
     values, vectors = np.linalg.eigh(best.covariance / best.inflation**2 * (unit[:, None] * unit))
-    direction = vectors[:, -1]
+    axes = vectors / unit[:, None]
     sd = math.sqrt(max(float(values[-1]), 0.0))
-    spot_of_rod = np.full((2, len(model)), -1, dtype=np.intp)
+    rise, offset, surprise = _profile(model, scene, best, axes, 3 * sd * np.array([1.0, -1.0]))
+    bend2 = ((offset @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
+    if float(surprise.max()) > RIVAL_SD:
+        return None, math.inf
+    if float(rise.min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
+        return best, 1.0
+    factors = np.linspace(1, _MOST_WIDENED, _PROFILE_POINTS)
+    rise, offset, surprise = _profile(model, scene, best, axes, 3 * sd * np.concatenate([factors, -factors]))
+    risen = np.maximum.accumulate(rise.reshape(2, -1), axis=1) >= 9
+    if not risen.any(axis=1).all():
+        return None, math.inf
+    ends = risen.argmax(axis=1)
+    rows = ends + [0, len(factors)]
+    if float(surprise[rows].max()) > RIVAL_SD:
+        return None, math.inf
+    # the valley may bend: the ellipsoid has to reach its ends where they are, not where its axis points
+    reach, straight = offset[rows] / 3, axes[:, -1] * sd
+    spread = reach.T @ reach / 2 - np.outer(straight, straight)
+    covariance = best.covariance + best.inflation**2 * _positive_part(spread)
+    return replace(best, covariance=frozen(covariance, (6, 6))), float(factors[ends].max())
+
+
+def _profile(
+    model: RodModel, scene: Scene, best: Candidate, axes: FloatArray, steps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How much χ² rises (b,) at ``steps`` (b,) along the last of ``axes`` (6, 6) while the others give way.
+
+    Returns the rises; the twists (b, 6) from the pose to where they are reached; and how many standard deviations *of
+    there* the pose is off, in rotation or place (b,): what its error would be called if the truth were there.
+    """
+    b = len(steps)
+    spot_of_rod = np.full((b, len(model)), -1, dtype=np.intp)
     spot_of_rod[:, best.rod_index] = best.spot_index
     seen = observations(scene, spot_of_rod)
-    T0 = np.repeat(best.T_slice_model[None], 2, axis=0)
-    offset = 3 * sd * np.stack([direction, -direction])
-    T = poses.update(T0, offset / unit)
-    complement = vectors[:, :-1]
-    basis = complement / unit[:, None]
-    for _ in range(4):  # let the other five directions give way: the profile, not a cut
-        fit = linearise(model, T, seen)
-        H, g = fit.normal_equations()
+    T = poses.update(np.repeat(best.T_slice_model[None], b, axis=0), steps[:, None] * axes[:, -1])
+    basis = axes[:, :-1]
+    for _ in range(5):
+        H, g = linearise(model, T, seen).normal_equations()
         Hc = basis.T @ H @ basis
-        step = np.linalg.solve(
-            Hc + 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None], (g @ basis)[..., None]
-        )
-        T = poses.update(T, step[..., 0] @ basis.T)
-    rise = linearise(model, T, seen).chi2 - best.chi2
-    least = float(np.min(np.where(np.isfinite(rise), rise, 9.0)))
-    if least > 0.6 * 9:
-        return best, 1.0
-    if least < _LEAST_RISE:
-        return None, math.inf
-    factor = 3 / math.sqrt(least)
-    widened = (
-        best.covariance + (factor**2 - 1) * np.outer(direction / unit, direction / unit) * sd**2 * best.inflation**2
-    )
-    return replace(best, covariance=frozen(widened, (6, 6))), factor
+        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
+        T = poses.update(T, np.linalg.solve(Hc, (g @ basis)[..., None])[..., 0] @ basis.T)
+    there = linearise(model, T, seen)
+    rise = there.chi2 - best.chi2
+    offset = poses.difference(T, best.T_slice_model)
+    C, _ = covariance_from_information(there.normal_equations()[0], model.size_mm)
+    variance = np.einsum("bii->bi", C)
+    parts = np.stack([(offset[:, 3 * k : 3 * k + 3] ** 2).sum(axis=1) for k in (0, 1)], axis=1)
+    own = np.stack([variance[:, 3 * k : 3 * k + 3].sum(axis=1) for k in (0, 1)], axis=1)
+    return np.where(np.isfinite(rise), rise, 9.0), offset, np.sqrt((parts / np.maximum(own, 1e-300)).max(axis=1))
