@@ -31,6 +31,7 @@ class Outlook:
         """``crossing``: of all rods with ``T``, where it has been worked out already."""
         self.model, self.scene, self.T = model, scene, T
         self.crossing = crossing or cross(T, model_lines(model))
+        self._mm_per_height = self.crossing.mm_per_height()
         self._slack_mm = self._end_slack_mm()
         self._in_field = self._inside_image()
 
@@ -39,8 +40,7 @@ class Outlook:
         S = self.scene.covariance_mm
         spot2 = 0.5 * float((S[:, 0, 0] + S[:, 1, 1]).max(initial=0.0))
         noise = math.sqrt(spot2 + greatest_tolerance_mm(self.model) ** 2)
-        slack = self.crossing.mm_per_height()
-        slack *= self.scene.half_slab_mm + _END_SD * noise
+        slack: FloatArray = self._mm_per_height * (self.scene.half_slab_mm + _END_SD * noise)
         slack += _END_SIZES * self.model.size_mm
         return slack
 
@@ -64,6 +64,15 @@ class Outlook:
         along = self.crossing.lambda_mm
         between: BoolArray = (along >= margin_mm) & (along <= self.model.lengths - margin_mm)
         return between if self._in_field is None else between & self._in_field
+
+    def rod_end_shift_mm(self, rods: IntArray) -> float:
+        """How far in z a spot may lie off its crossing because one of ``rods`` ends inside the slab, at most; mm."""
+        half_slab_mm = self.scene.half_slab_mm
+        if half_slab_mm == 0:
+            return 0.0
+        along = self.crossing.lambda_mm
+        to_end = np.minimum(along, self.model.lengths - along) / self._mm_per_height
+        return max(0.0, half_slab_mm - float(to_end[rods].min()))
 
     def assigned(self, covariance: FloatArray) -> IntArray:
         """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6)."""

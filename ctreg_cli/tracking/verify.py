@@ -29,7 +29,6 @@ from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.gate import Outlook
 from ctreg_cli.tracking.servo import Desired, ServoResult, view
 from ctreg_cli.tracking.single import (
-    Crossing,
     determinant_2x2,
     difference,
     inverse_2x2,
@@ -61,6 +60,7 @@ _TOUCHING_DIAMETERS, _TOUCHING_SIZE = 2.0, 0.05
 _FIXES_ALONE = 1e-9
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
 _NEIGHBOURHOOD, _LEAST_REACH = 1.25, 1e-3
+_NONE = np.empty(0, dtype=np.intp)
 
 
 def verified(
@@ -95,14 +95,14 @@ def verified(
     if _is_vaguer(C, VAGUE_POSE_RAD) or _is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
         return None
     crossings = outlook.crossing
-    missing = np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
+    missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
     if (
         not outlook.may_be_seen()[rods].all()
         or len(missing) > len(rods)
         or _touching(model, crossings.xy_mm, rods, missing)
     ):
         return None
-    if rod_end_shift_mm(model, rods, crossings, scene.half_slab_mm) > 0:
+    if outlook.rod_end_shift_mm(rods) > 0:
         return None
     without = LeftOut.of(moved)
     if without is None or _contested(scene, moved, without, spot_of_rod[rods]):
@@ -205,15 +205,6 @@ def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntAr
     d_x, d_y = x[there, None] - x[rods], y[there, None] - y[rods]
     near = d_x * d_x + d_y * d_y < _reach_mm(model) ** 2
     return int(np.count_nonzero(near)) > len(rods)  # each lies on itself
-
-
-def rod_end_shift_mm(model: RodModel, rods: IntArray, crossing: Crossing, half_slab_mm: float) -> float:
-    """How far in z a spot may lie off its crossing because a seen rod ends inside the slab, at most; mm."""
-    if half_slab_mm == 0:
-        return 0.0
-    along = crossing.lambda_mm
-    to_end = np.minimum(along, model.lengths - along) / crossing.mm_per_height()
-    return max(0.0, half_slab_mm - float(to_end[rods].min()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
