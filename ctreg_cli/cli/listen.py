@@ -121,7 +121,7 @@ def listen(
         quiet=quiet,
         verbose=verbose,
     )
-    with listening(options, igtl=igtl, quiet=quiet) as session:
+    with listening(options, model=model, igtl=igtl, quiet=quiet) as session:
         run_poses(
             "listen",
             lambda slices, frame, mm_per_px, segmentation: track_live(

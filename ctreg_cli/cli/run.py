@@ -12,7 +12,7 @@ import typer
 from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.imaging.slice import Slice, SliceInfo
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
-from ctreg_cli.io.sinks import Sinks
+from ctreg_cli.io.sinks import Sinks, uninterrupted
 from ctreg_cli.io.sources import Source, open_sources
 from ctreg_cli.pipeline import SliceLike
 from ctreg_cli.rods import RodModel
@@ -139,9 +139,10 @@ def consume(
     try:
         with sinks:
             for result in talk.progress(results, total=total, what=what):
-                sinks.write(result)
-                on_result(result)
-                done += 1
+                with uninterrupted():
+                    sinks.write(result)
+                    on_result(result)
+                    done += 1
                 if not sinks.alive:
                     return
     except KeyboardInterrupt:

@@ -12,6 +12,7 @@ from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.cli.run import Watched
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.io.sinks import Sink
 from ctreg_cli.io.sources import Source
 from ctreg_cli.pipeline import FrameResult, SliceLike
@@ -73,9 +74,9 @@ class Session:
 
 
 def open_session(
-    inputs: Sequence[str], *, watch: str | None, idle: float | None, count: int | None, igtl: str | None
+    inputs: Sequence[str], *, model: str, watch: str | None, idle: float | None, count: int | None, igtl: str | None
 ) -> Session:
-    """What ``--watch`` and ``--igtl`` ask for.
+    """What ``--watch`` and ``--igtl`` ask for; before slices may come, all is ready for those of ``model``.
 
     Raises:
         InputError: inputs and a folder to watch, or neither; a folder or an address that cannot be used.
@@ -88,9 +89,11 @@ def open_session(
         raise InputError("name the slices: INPUT..., or --watch DIR")
     source, sinks, remarks = None, [], []
     if watch is not None:
+        from ctreg_cli.interop.live import warm_up
         from ctreg_cli.io.watch import WatchedFolder, WatchOptions
 
         folder = WatchedFolder(Path(watch), WatchOptions(idle_s=idle, count=count))
+        warm_up(load_rod_model(model))
         source = Source(slices=Arriving(folder), kind="images")
         remarks.append(lambda: [("skipped", counted(folder.skipped))] if folder.skipped else [])
     if igtl is not None:
@@ -119,7 +122,7 @@ def open_igtl(address: str) -> tuple[Sink[FrameResult], Callable[[], list[tuple[
 
 
 @contextmanager
-def listening(options: ListenOptions, *, igtl: str | None, quiet: bool) -> Iterator[Session]:
+def listening(options: ListenOptions, *, model: str, igtl: str | None, quiet: bool) -> Iterator[Session]:
     """Listen for slices for as long as the block lasts.
 
     Raises:
@@ -128,7 +131,7 @@ def listening(options: ListenOptions, *, igtl: str | None, quiet: bool) -> Itera
     from ctreg_cli.interop.dicom_listener import DicomListener
     from ctreg_cli.interop.live import warm_up
 
-    warm_up()
+    warm_up(load_rod_model(model))
     talk = Talk(quiet=quiet)
     sinks, remarks = [], []
     if igtl is not None:

@@ -7,6 +7,7 @@ queue; only then does the sender get its answer. Nothing a peer says is shown or
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import ssl
 import tempfile
@@ -50,6 +51,7 @@ _COMPRESSED = (
 # PS3.4 B.2.3: what the sender is told
 SUCCESS, OUT_OF_RESOURCES, CANNOT_UNDERSTAND = 0x0000, 0xA700, 0xC000
 
+_MEMORY_FOLDER = Path("/dev/shm")
 #: SOP instances remembered, to know again what is sent a second time
 _REMEMBERED = 10_000
 _FILE_NAME = re.compile(r"slice_(\d{6,})\.dcm")
@@ -106,7 +108,7 @@ class DicomListener:
         self._order = LiveOrder()
         self._seen: OrderedDict[str, None] = OrderedDict()
         self._tokens, self._filled_s = options.max_rate_hz, time.monotonic()
-        self._scratch = tempfile.TemporaryDirectory(prefix="ctreg-")
+        self._scratch = tempfile.TemporaryDirectory(prefix="ctreg-", dir=_memory_folder())
         self._folder = Path(self._scratch.name) if options.keep is None else options.keep
         try:
             self._numbers = itertools.count(_next_number(self._folder) if options.keep else 0)
@@ -238,6 +240,11 @@ class DicomListener:
                 return False
             self._tokens -= 1
             return True
+
+
+def _memory_folder() -> Path | None:
+    """A folder in memory, where there is one: slices need no disk to go through, and leave nothing on it."""
+    return _MEMORY_FOLDER if os.access(_MEMORY_FOLDER, os.W_OK | os.X_OK) else None
 
 
 def _echo(event: Any) -> int:

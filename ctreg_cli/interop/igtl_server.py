@@ -1,8 +1,8 @@
 """An OpenIGTLink server: whoever connects gets every result from then on; nobody can hold the tracker up.
 
-One thread serves all clients with a selector. ``send`` only puts bytes where that thread finds them and returns. A
-client that reads too slowly loses whole slices, the oldest first, counted; one that is dead is closed; what clients say
-is read and thrown away.
+``send`` gives each client at once what it takes without waiting; one thread with a selector lets clients in and hears
+when a slow one takes more. A client that reads too slowly loses whole slices, the oldest first, counted; one that is
+dead is closed; what clients say is read and thrown away.
 """
 
 from __future__ import annotations
@@ -72,6 +72,8 @@ class IgtlServer:
         #: slices that slow clients did not get, clients turned away
         self.dropped = self.refused = 0
         self._outbox: deque[bytes] = deque()
+        #: held by whoever serves clients; nobody waits for a client while holding it
+        self._serving = threading.Lock()
         self._clients: dict[socket.socket, _Client] = {}
         self._selector = selectors.DefaultSelector()
         self._bell, self._bell_rope = socket.socketpair()
@@ -89,9 +91,19 @@ class IgtlServer:
         return len(self._clients)
 
     def send(self, data: bytes) -> None:
-        """Give the messages of one slice to every client; returns at once."""
+        """Give the messages of one slice to every client; returns at once.
+
+        They leave from here, not from the server's thread, which would have to be woken first; unless that is just
+        serving clients: then it finds them when it has done so.
+        """
         self._outbox.append(data)
-        self._ring()
+        if self._serving.acquire(blocking=False):
+            try:
+                self._hand_out()
+            finally:
+                self._serving.release()
+        else:
+            self._ring()
 
     def close(self) -> None:
         """Let clients take what is waiting, for a moment, and close."""
@@ -121,7 +133,7 @@ class IgtlServer:
     ) -> None:
         self.close()
 
-    # What follows runs in the server's own thread.
+    # What follows runs in the server's own thread, or under the lock.
 
     def _ring(self) -> None:
         with contextlib.suppress(OSError):  # full: it rings already; closed: nobody is there to hear
@@ -130,20 +142,12 @@ class IgtlServer:
     def _serve(self) -> None:
         end_s: float | None = None
         while True:
-            for key, events in self._selector.select(_TICK_S):
-                if key.fileobj is self._listener:
-                    self._accept()
-                elif key.fileobj is self._bell:
-                    with contextlib.suppress(OSError):
-                        self._bell.recv(_READ_BYTES)
-                else:
-                    client = key.data
-                    if events & selectors.EVENT_READ and not self._read(client):
-                        continue
-                    if events & selectors.EVENT_WRITE:
-                        self._write(client)
-            self._hand_out()
-            self._bury()
+            ready = self._selector.select(_TICK_S)
+            with self._serving:
+                for key, events in ready:
+                    self._serve_one(key, events)
+                self._hand_out()
+                self._bury()
             if self._stopping.is_set():
                 end_s = end_s or time.monotonic() + _FAREWELL_S
                 if time.monotonic() >= end_s or not any(client.is_behind for client in self._clients.values()):
@@ -153,6 +157,19 @@ class IgtlServer:
         self._selector.close()
         for end in (self._listener, self._bell, self._bell_rope):
             end.close()
+
+    def _serve_one(self, key: selectors.SelectorKey, events: int) -> None:
+        if key.fileobj is self._listener:
+            self._accept()
+        elif key.fileobj is self._bell:
+            with contextlib.suppress(OSError):
+                self._bell.recv(_READ_BYTES)
+        elif key.fileobj in self._clients:  # and not dropped since it was heard of
+            client = key.data
+            if events & selectors.EVENT_READ and not self._read(client):
+                return
+            if events & selectors.EVENT_WRITE:
+                self._write(client)
 
     def _accept(self) -> None:
         try:

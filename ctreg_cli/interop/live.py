@@ -5,22 +5,26 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 
 from ctreg_cli.errors import MissingScaleError
-from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
-from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
+from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.imaging.slice import SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.pipeline import FrameResult, SliceLike, failure, no_spots, track_slice
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.simulation.defaults import suitable_settings
+from ctreg_cli.simulation.phantom import simulate_slice
+from ctreg_cli.simulation.start import centred_pose
 from ctreg_cli.tracking.tracker import Tracker
 
-#: of the slice that is only looked at to load what looking needs, px
-_BLANK_SIDE = 64
+#: slices tracked before the first real one: one to find the frame, two to follow it
+_REHEARSALS = 3
 #: Python's own is 5 ms, a third of what a slice may take
 _SWITCH_S = 0.001
 
@@ -63,15 +67,21 @@ def track_live(
         yield result
 
 
-def warm_up() -> None:
-    """Ready this process for slices in real time.
+def warm_up(model: RodModel) -> None:
+    """Ready this process for slices of ``model`` in real time.
 
-    Loaded is what the first slice would otherwise wait for: the readers, and the libraries behind the segmentation.
+    Loaded is what the first slice would otherwise wait for: the readers, and whatever the method needs, which a few
+    simulated slices of this very frame bring out, the last without it.
     """
     import_module("ctreg_cli.io.dicom")
-    blank = np.zeros((_BLANK_SIDE, _BLANK_SIDE), dtype=np.int16)
-    blank[_BLANK_SIDE // 2, _BLANK_SIDE // 2] = np.iinfo(np.int16).max
-    find_spots(Slice(info=SliceInfo(source=""), stored=blank), SegmentationOptions())
+    settings = suitable_settings(model)
+    pose = centred_pose(model, settings, np.eye(3))
+    rng = np.random.default_rng(0)
+    info = SliceInfo(source="")
+    seen: list[SliceLike] = [simulate_slice(model, pose, settings, rng, info).slice for _ in range(_REHEARSALS)]
+    seen.append(SpotSlice(info=replace(info, scale=settings.scale), spots=no_spots()))
+    for _ in track_live(seen, model):
+        pass
     # a full garbage collection over everything loaded takes longer than a slice may: leave that out of every later one
     gc.collect()
     gc.freeze()

@@ -245,8 +245,8 @@ class TrajectoryFile(Generic[Item]):
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back while a record is written, so that an interrupted file still holds whole records only."""
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back, so that what is written is whole records, and what is said of them is true."""
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
@@ -301,7 +301,7 @@ class Sinks(Generic[Item]):
         Raises:
             InputError: an output cannot be written, and the others shall not do without it.
         """
-        with _uninterrupted():
+        with uninterrupted():
             for name, sink in tuple(self._sinks):
                 try:
                     sink.write(item)
@@ -330,7 +330,7 @@ class Sinks(Generic[Item]):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         finish = kind is None or issubclass(kind, KeyboardInterrupt)
-        with _uninterrupted():
+        with uninterrupted():
             while self._sinks:
                 name, sink = self._sinks.pop(0)
                 try:
