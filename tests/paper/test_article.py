@@ -88,7 +88,7 @@ def test_the_end_error_is_the_statistical_bound(noisy: dict[Strategy, list[Servo
 def test_both_strategies_end_alike(noisy: dict[Strategy, list[ServoRun]]) -> None:
     """ "The two control strategies provide similar results"."""
     for a, b in zip(*noisy.values(), strict=True):
-        # a tenth of the sd
+        # less than one sd apart, by the same noise
         sd = np.sqrt(np.diag(a.bound))
         assert np.abs((a.error[-1] - b.error[-1]) / sd).max() < 1.0
     mean = {s: np.mean([one.angle_sum_deg[-1] for one in noisy[s]]) for s in STRATEGIES}
