@@ -51,6 +51,8 @@ LEAST_RISE, MOST_RISE = 4.5, 18.0
 NEAR_PX = 25.0
 #: displacements of the start, mm and degrees
 BASIN = ((5, 2), (20, 10), (40, 20), (80, 20), (20, 45), (20, 60), (20, 75), (20, 90), (20, 120), (20, 150))
+#: sequences between two reports
+REPORT_EVERY = 10
 #: one in so many settled slices is put to the oracle
 SAMPLED = 20
 
@@ -383,9 +385,10 @@ def main() -> None:
         total = Tally()
         job = partial(run, n=a.slices, jacobian=jacobian, sd_px=a.sd)
         with ProcessPoolExecutor(a.workers) as pool:
-            for part in pool.map(job, range(a.first, a.first + a.sequences)):
+            for done, part in enumerate(pool.map(job, range(a.first, a.first + a.sequences)), 1):
                 total.add(part)
-        report(jacobian, a.sequences, a.slices, total)
+                if done % REPORT_EVERY == 0 or done == a.sequences:
+                    report(jacobian, done, a.slices, total)
 
 
 if __name__ == "__main__":
