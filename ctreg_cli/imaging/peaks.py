@@ -15,6 +15,8 @@ from ctreg_cli.imaging.window import UprightImage, nan_quantile
 
 #: side of the blocks whose least value is the first, generous background, px
 BLOCK_PX = 16
+#: step in which large things are looked for, px
+COARSE_PX = 4
 #: samples on each ring, and each ring's radius over the last one's
 RING_SAMPLES, RING_RATIO = 16, 1.3
 
@@ -73,3 +75,16 @@ def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_h
     fallen = rings < (heights - 0.5 * contrast)[:, None]
     half_width = np.where(fallen.any(axis=1), radii[fallen.argmax(axis=1)], np.inf)
     return Peaks(pixels=pixels, contrast=contrast, half_width=half_width)
+
+
+def large_regions(smooth: NDArray[Any], level: float, least_px: float) -> FloatArray:
+    """Boxes (m, 4) = (u, v from, u, v to) of bright regions wider and higher than ``least_px``, on a coarse grid."""
+    from scipy.ndimage import find_objects, label
+
+    labels, _ = label(smooth[::COARSE_PX, ::COARSE_PX] > level)
+    boxes = [
+        (columns.start, rows.start, columns.stop - 1, rows.stop - 1)
+        for rows, columns in find_objects(labels)
+        if min(columns.stop - columns.start, rows.stop - rows.start) * COARSE_PX > least_px
+    ]
+    return COARSE_PX * np.array(boxes, dtype=np.float64).reshape(-1, 4)

@@ -11,16 +11,17 @@ sorted out, the rest ranked → centres and covariances (:mod:`.localisation`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, joined, measure_blobs, measure_lone_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
 from ctreg_cli.imaging.maxima import local_maxima, smoothed
-from ctreg_cli.imaging.peaks import Peaks, image_noise, maxima_above, rate_peaks
+from ctreg_cli.imaging.peaks import COARSE_PX, Peaks, image_noise, large_regions, maxima_above, rate_peaks
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.imaging.window import UprightImage, grid
@@ -66,6 +67,8 @@ FIRST_LOOK = 0.5
 SMOOTHING_LOSS = 0.5
 #: so many peaks are measured for one spot asked for: bounds the time on images of noise
 PEAKS_PER_SPOT = 6
+#: things are bright that lie above this share of the range between the image's median and its brightest
+LARGE_SHARE = 0.25
 #: at most so many rejected candidates are reported
 MAX_REJECTED = 100
 
@@ -123,8 +126,24 @@ def _find(slice_: Slice, options: SegmentationOptions, *, bright: bool) -> Spots
         spots = _spots_of(image, groups, options, rejections)
         needed = max(least, share * float(spots.contrast.max(initial=0.0)) / image.unit)
         if margin <= needed:
-            return spots
+            return _with_large_regions(spots, image, smooth, limits)
         margin = needed
+
+
+def _with_large_regions(spots: Spots, image: UprightImage, smooth: NDArray[Any], limits: _Limits) -> Spots:
+    """The same spots, and among the rejected what is bright and so large that it has no peak of its own."""
+    sample = smooth[::COARSE_PX, ::COARSE_PX]
+    sample = sample[np.isfinite(sample)]
+    if not sample.size:
+        return spots
+    common = float(np.median(sample))
+    boxes = large_regions(smooth, common + LARGE_SHARE * (image.ceiling - common), limits.width_px)
+    seen = np.vstack([spots.uv_px, *([[r.u_px, r.v_px]] for r in spots.rejected)])
+    inside = np.all((seen >= boxes[:, None, :2]) & (seen <= boxes[:, None, 2:]), axis=2)
+    unseen = boxes[~np.any(inside, axis=1)]
+    rejections = _Rejections(spots=list(spots.rejected))
+    rejections.add(0.5 * (unseen[:, :2] + unseen[:, 2:]), "too_large")
+    return replace(spots, rejected=tuple(rejections.spots))
 
 
 def _measure(

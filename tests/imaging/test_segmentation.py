@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -178,6 +179,19 @@ def test_what_is_no_rod_is_left_out_with_the_reason(values: object, reason: str)
     assert reason in {r.reason for r in spots.rejected}
 
 
+@pytest.mark.parametrize("radius_px", [10, 20, 60])
+def test_what_is_far_too_large_is_named_once(radius_px: int) -> None:
+    row, column = np.mgrid[:160, :160]
+    body = 2000.0 * (np.hypot(row - 80, column - 76) < radius_px) + np.random.default_rng(2).normal(
+        0.0, 15.0, (160, 160)
+    )
+    spots = find_spots(as_slice(body + render_rod((160, 160), (9.3, 9.2))))
+    np.testing.assert_allclose(spots.uv_px, [[9.3, 9.2]], atol=0.05)
+    (rejected,) = spots.rejected
+    assert rejected.reason == "too_large"
+    assert np.hypot(rejected.u_px - 76, rejected.v_px - 80) < 4.0
+
+
 def test_the_best_spots_are_kept_when_there_are_too_many(image: np.ndarray) -> None:
     weak = image + render_rod(SHAPE, (60.0, 20.0), contrast=1500.0)
     spots = find_spots(as_slice(weak), SegmentationOptions(max_spots=3))
@@ -211,6 +225,31 @@ def test_measuring_about_predictions_gives_what_searching_the_slice_gives(image:
         nearest = np.linalg.norm(measured.uv_px[:, None] - found.uv_px, axis=2).argmin(axis=0)
         np.testing.assert_allclose(measured.uv_px[nearest], found.uv_px, atol=1e-3)
         np.testing.assert_allclose(measured.covariance_px[nearest], found.covariance_px, rtol=0.05)
+
+
+def test_tracking_the_simulated_ct_gives_spots_and_covariances_of_the_whole_slice() -> None:
+    rng = np.random.default_rng(5)
+    for slice_, _ in islice(cube_slices(), 5):
+        found = find_spots(slice_)
+        measured = measure_spots(slice_, found.uv_px + rng.uniform(-2, 2, found.uv_px.shape), 4.0)
+        nearest = np.linalg.norm(measured.uv_px[:, None] - found.uv_px, axis=2).argmin(axis=0)
+        np.testing.assert_allclose(measured.uv_px[nearest], found.uv_px, atol=1e-6)
+        np.testing.assert_allclose(measured.covariance_px[nearest], found.covariance_px, rtol=0.05, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "neighbour", [{"uv": (84.5, 62.0), "contrast": 4000.0}, {"uv": (80.7, 67.0), "contrast": 2500.0}]
+)
+def test_a_neighbour_in_the_window_is_measured_as_in_the_whole_slice(
+    image: np.ndarray, neighbour: dict[str, object]
+) -> None:
+    slice_ = as_slice(np.clip(image + render_rod(SHAPE, **neighbour), -1024, 3071))  # type: ignore[arg-type]
+    found = find_spots(slice_)
+    measured = measure_spots(slice_, UV, 9.0)
+    assert len(measured) == len(found) == 4
+    nearest = np.linalg.norm(measured.uv_px[:, None] - found.uv_px, axis=2).argmin(axis=0)
+    np.testing.assert_allclose(measured.uv_px[nearest], found.uv_px, atol=1e-6)
+    np.testing.assert_allclose(measured.covariance_px[nearest], found.covariance_px, rtol=0.05, atol=1e-9)
 
 
 def test_a_spot_near_two_predictions_is_measured_once_and_nothing_where_nothing_is(image: np.ndarray) -> None:
