@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ctreg_cli import pipeline
 from ctreg_cli.imaging.slice import SliceInfo, UnreadableSlice
@@ -15,6 +16,7 @@ from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.single import cross, model_lines
 from ctreg_cli.tracking.tracker import Tracker
 from tests.oracle import OracleFrame, random_frame
 from tests.tracking.sequences import Sequence, error_of, frame_of, is_wrong, model_of, sequence
@@ -72,15 +74,27 @@ def test_the_method_says_how_a_pose_was_found(strategy: str) -> None:
         assert result.stability > 0
 
 
-def test_a_constant_jacobian_is_renewed_when_it_no_longer_serves_and_says_why() -> None:
-    """The frame drifts through 40°: one Jacobian cannot do for all of it."""
-    made = clean("drift", n=40, seed=8)
-    far = sequence(8, kind="drift", n=40, model=CUBE, sd_px=0.05, p_missing=0.0, most_false=0)
-    results = track(far, jacobian="constant")
-    assert not wrong(results, made)
-    renewed = [r for r in results[1:] if r.method == "registered"]
-    assert renewed or min(r.stability for r in results if r.stability is not None) > 0.5
-    assert all("registered_anew" in dict(r.warnings) for r in renewed)
+@pytest.mark.parametrize(
+    ("turn_deg", "because"), [(25.0, "inefficient"), (170.0, "servo did not converge")], ids=["stale", "unstable"]
+)
+def test_a_constant_jacobian_is_renewed_when_it_no_longer_serves_and_says_why(turn_deg: float, because: str) -> None:
+    """One kept from a pose turned since: the slice is settled all the same, and the next ones by the new Jacobian."""
+    made = clean("drift", n=9, seed=8)
+    tracker = Tracker(made.model, TrackingOptions(jacobian="constant"))
+    scale = Scale(s_x=0.5, s_y=0.5)
+    results = [tracker.step(item.spots, item.info, scale) for item in made.slices[:6]]
+    assert results[-1].method == "constant"
+    turned = results[-1].registration.candidates[0].T_slice_model.copy()
+    turned[:3, :3] = Rotation.from_euler("xz", [0.6 * turn_deg, turn_deg], degrees=True).as_matrix() @ turned[:3, :3]
+    tracker._kept_jacobian = cross(turned, model_lines(made.model)).jacobian
+    results += [tracker.step(item.spots, item.info, scale) for item in made.slices[6:]]
+    assert [r.method for r in results[6:]] == ["registered", "constant", "constant"]
+    assert because in dict(results[6].registration.warnings)["registered_anew"]
+    for result, true in zip(results, made.truth, strict=True):
+        best = result.registration.candidates[0]
+        assert result.stability is not None
+        assert result.stability > 0.5
+        assert not is_wrong(best.T_slice_model, best.covariance, true)
 
 
 @pytest.mark.parametrize("seed", range(2))
