@@ -93,6 +93,15 @@ def spots_of(slice_: SliceLike, options: SegmentationOptions) -> SpotSlice:
             return SpotSlice(info=slice_.info, spots=find_spots(slice_, options))
 
 
+def expecting(model: RodModel, segmentation: SegmentationOptions | None) -> SegmentationOptions:
+    """The options, with the diameters of the model's rods where it knows them all and the options say nothing."""
+    options = segmentation or SegmentationOptions()
+    known = [rod.diameter_mm for rod in model.rods if rod.diameter_mm is not None]
+    if options.rod_diameter_mm is not None or len(known) < len(model.rods):
+        return options
+    return replace(options, rod_diameter_mm=(min(known), max(known)))
+
+
 def no_spots() -> Spots:
     """A slice in which nothing was found."""
     return Spots(uv_px=np.empty((0, 2)), covariance_px=np.empty((0, 2, 2)))
@@ -119,7 +128,7 @@ def pose(
         MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
     """
     options = options or RegistrationOptions()
-    segmentation = segmentation or SegmentationOptions()
+    segmentation = expecting(model, segmentation)
     seen_scale = scale is not None
     for place, item in enumerate(segment(slices, segmentation)):
         seen_scale |= item.info.scale is not None
@@ -171,7 +180,7 @@ def pose_joint(
         InputError: no slice of a series has a place in the patient.
         MissingScaleError: no slice of a series has a scale, and none was given.
     """
-    items = list(segment(slices, segmentation or SegmentationOptions()))
+    items = list(segment(slices, expecting(model, segmentation)))
     rows: dict[int, Registration] = {}
     for series in dict.fromkeys(item.info.series for item in items):
         places = [place for place, item in enumerate(items) if item.info.series == series]
@@ -203,7 +212,7 @@ def track(
     Raises:
         MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
     """
-    segmentation = segmentation or SegmentationOptions()
+    segmentation = expecting(model, segmentation)
     tracker = Tracker(model, options)
     seen_scale = scale is not None
     for place, slice_ in enumerate(slices):

@@ -14,7 +14,7 @@ from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.imaging.slice import SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
-from ctreg_cli.pipeline import FrameResult, SliceLike, failure, no_spots, track_slice
+from ctreg_cli.pipeline import FrameResult, SliceLike, expecting, failure, no_spots, track_slice
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -51,7 +51,7 @@ def track_live(
         segmentation: see :class:`SegmentationOptions`.
         on_fault: told, in a sentence, what went wrong inside.
     """
-    segmentation = segmentation or SegmentationOptions()
+    segmentation = expecting(model, segmentation)
     tracker = Tracker(model, options)
     for place, slice_ in enumerate(slices):
         try:

@@ -13,6 +13,8 @@ import pytest
 
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, find_spots, measure_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo
+from ctreg_cli.pipeline import expecting
+from ctreg_cli.rods import Rod, RodModel
 from ctreg_cli.scale import Scale
 from tests.imaging.rendering import as_slice, render_rod
 
@@ -264,3 +266,17 @@ def test_only_spots_within_the_radius_are_returned(image: np.ndarray) -> None:
     slice_ = as_slice(image)
     assert len(measure_spots(slice_, UV[:1] + np.array([4.0, 0.0]), 5.0)) == 1
     assert not len(measure_spots(slice_, UV[:1] + np.array([4.0, 0.0]), 3.0))
+
+
+def test_the_rods_of_the_model_say_how_thick_a_spot_may_be() -> None:
+    def model(*diameters_mm: float | None) -> RodModel:
+        rods = [
+            Rod(id=f"r{i}", start=np.array([10.0 * i, i * i, 0]), end=np.array([9.0 * i, 0, 50]), diameter_mm=d)
+            for i, d in enumerate(diameters_mm)
+        ]
+        return RodModel(name="three", rods=tuple(rods))
+
+    assert expecting(model(1.0, 2.0, 1.5), None).rod_diameter_mm == (1.0, 2.0)
+    assert expecting(model(1.0, None, 1.5), None).rod_diameter_mm is None
+    given = SegmentationOptions(rod_diameter_mm=(3.0, 4.0))
+    assert expecting(model(1.0, 2.0, 1.5), given) is given
