@@ -79,7 +79,6 @@ def export(
     from ctreg_cli.cli.console import Talk
     from ctreg_cli.interop.exports import check_export, write_export
     from ctreg_cli.interop.selection import select
-    from ctreg_cli.interop.trajectories import has_times
     from ctreg_cli.io.frame_of_results import frame_of_results
     from ctreg_cli.io.results_document import read_document
 
@@ -90,7 +89,7 @@ def export(
     contents = [
         select(document, space=coordinates.value if coordinates else kind.space, model=frame) for kind in formats
     ]
-    if any(kind.has_times for kind in formats) and not has_times(contents[0]):
+    if any(kind.has_times for kind in formats) and not contents[0].has_times:
         talk.warn(f"{results}: the slices have no time; their numbers stand for seconds")
     for name, content in zip(output, contents, strict=True):
         written = write_export(name, content, index=slice_number)

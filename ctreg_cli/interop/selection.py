@@ -31,6 +31,15 @@ class Content:
         return self.document.ok
 
     @property
+    def has_times(self) -> bool:
+        """Whether every usable slice has a time; else the numbers of the slices stand for seconds, of all of them."""
+        return all(record.time_s is not None for record in self.usable)
+
+    def time_s(self, record: SliceRecord) -> float | None:
+        """Seconds; None for a slice that has no time where the usable ones have theirs."""
+        return record.time_s if self.has_times else float(record.index)
+
+    @property
     def model_name(self) -> str:
         """What to call the frame."""
         return self.document.model_name or (self.model.name if self.model else "") or "model"
@@ -61,8 +70,3 @@ def select(document: ResultsDocument, *, space: Space | None = None, model: RodM
     for record in usable:
         content.pose(record)
     return content
-
-
-def time_of(record: SliceRecord) -> float:
-    """Seconds; the slice's number where it has no time."""
-    return float(record.index) if record.time_s is None else record.time_s

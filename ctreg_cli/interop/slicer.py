@@ -9,7 +9,7 @@ import numpy as np
 
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import InputError
-from ctreg_cli.interop.selection import Content, time_of
+from ctreg_cli.interop.selection import Content
 from ctreg_cli.io.results_document import SliceRecord
 
 MARKUPS_SCHEMA = (
@@ -95,10 +95,11 @@ def transform_sequence(content: Content) -> bytes:
     """The pose of every slice as a sequence of linear transforms, model → slice or patient (RAS, mm).
 
     A slice without an ``ok`` pose is a frame whose status is ``INVALID`` and which has no matrix: 3D Slicer then shows
-    none, where an identity would be a pose.
+    none, where an identity would be a pose. One of which nobody knows when it was taken, where of the others it is
+    known, has no place in the sequence.
     """
     name = f"ModelTo{'Patient' if content.space == 'patient' else 'Slice'}Transform"
-    records = content.document.records
+    records = [record for record in content.document.records if content.time_s(record) is not None]
     usable = set(map(id, content.usable))
     lines = [
         "ObjectType = Image",
@@ -122,6 +123,6 @@ def transform_sequence(content: Content) -> bytes:
             lines += [line, f"{field}_{name}Status = OK"]
         else:
             lines.append(f"{field}_{name}Status = INVALID")
-        lines.append(f"{field}_Timestamp = {time_of(record):.6f}")
+        lines.append(f"{field}_Timestamp = {content.time_s(record):.6f}")
     lines.append("ElementDataFile = LOCAL")
     return ("\n".join(lines) + "\n").encode()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 
 from ctreg_cli.geometry.pose import quaternion
-from ctreg_cli.interop.selection import MM_PER_M, Content, time_of
+from ctreg_cli.interop.selection import MM_PER_M, Content
 
 _NANOSECONDS = 1_000_000_000
 #: what a ROS frame name may not hold
@@ -23,7 +22,7 @@ def tum(content: Content) -> bytes:
     for record in content.usable:
         T = content.pose(record)
         numbers = [*(T[:3, 3] / MM_PER_M).tolist(), *quaternion(T).tolist()]
-        lines.append(f"{time_of(record):.9f} {' '.join(f'{number:.15g}' for number in numbers)}")
+        lines.append(f"{content.time_s(record):.9f} {' '.join(f'{number:.15g}' for number in numbers)}")
     return _text(lines)
 
 
@@ -44,7 +43,7 @@ def tf_json(content: Content) -> bytes:
     for record in content.usable:
         T = content.pose(record)
         translation, rotation = (T[:3, 3] / MM_PER_M).tolist(), quaternion(T).tolist()
-        seconds, nanoseconds = divmod(round(time_of(record) * _NANOSECONDS), _NANOSECONDS)
+        seconds, nanoseconds = divmod(round((content.time_s(record) or 0.0) * _NANOSECONDS), _NANOSECONDS)
         transforms.append(
             {
                 "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": parent},
@@ -56,11 +55,6 @@ def tf_json(content: Content) -> bytes:
             }
         )
     return _text([json.dumps({"transforms": transforms}, indent=1, allow_nan=False)])
-
-
-def has_times(content: Content) -> bool:
-    """Whether the slices had times; else their numbers stand for seconds."""
-    return all(record.time_s is not None and math.isfinite(record.time_s) for record in content.usable)
 
 
 def _frame_name(name: str) -> str:

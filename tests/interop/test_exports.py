@@ -18,7 +18,7 @@ from ctreg_cli.interop.exports import FORMATS, check_export, write_export
 from ctreg_cli.interop.selection import Content, Space, select
 from ctreg_cli.io.results_document import read_document
 
-from .documents import SCALE_MM, STATUSES, frame, patient_from_slice, written
+from .documents import SCALE_MM, STATUSES, document_text, frame, patient_from_slice, written
 
 OK = [index for index, status in enumerate(STATUSES) if status == "ok"]
 
@@ -141,6 +141,29 @@ def test_transform_sequence_is_in_ras_and_lost_frames_have_no_matrix(content: Co
             M = np.array(fields[name].split(), dtype=float).reshape(4, 4)
             np.testing.assert_allclose(flip @ M @ flip, content.pose(content.document.records[index]), atol=1e-9)
     assert fields["DimSize"] == f"0 0 {len(STATUSES)}"
+
+
+def test_times_and_numbers_never_mix(tmp_path: Path) -> None:
+    """An unreadable slice has no time: it leaves the sequence. A pose without one: all slices go by their number."""
+
+    def stamps(*timeless: int) -> list[float]:
+        data = json.loads(document_text())
+        for index in timeless:
+            data["results"][index]["time_s"] = None
+        (tmp_path / "r.json").write_text(json.dumps(data), encoding="utf-8")
+        content = select(read_document(tmp_path / "r.json"))
+        write_export(str(tmp_path / "t.seq.mha"), content)
+        write_export(str(tmp_path / "t.tum"), content)
+        lines = (tmp_path / "t.seq.mha").read_text(encoding="ascii").splitlines()
+        found = [float(line.split(" = ")[1]) for line in lines if "_Timestamp" in line]
+        assert f"DimSize = 0 0 {len(found)}" in lines
+        assert set(np.loadtxt(tmp_path / "t.tum")[:, 0]) <= set(found)
+        return found
+
+    seconds = [36000 + 0.25 * index for index in range(len(STATUSES))]
+    lost = STATUSES.index("no_pose")
+    assert stamps(lost) == [time_s for index, time_s in enumerate(seconds) if index != lost]
+    assert stamps(OK[0]) == list(range(len(STATUSES)))
 
 
 def test_tum_and_kitti_are_metres(content: Content, tmp_path: Path) -> None:
