@@ -62,55 +62,48 @@ class Stages:
 
 
 def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
+    """All stages in turn, slice by slice; ``spots`` and ``tracker`` are parts of ``track``."""
     stages = Stages(len(files))
     clock = time.perf_counter
     segmentation = SegmentationOptions()
-    for _ in range(repeats):
-        out = io.StringIO()
-        tracker = Tracker(model)
-        with open_sinks(["-"], results_encoding(ResultsHeader(model=model)), out) as sinks:
-            series = open_images([files[0].parent])
-            for i, (file, record) in enumerate(zip(files, series.records, strict=True)):
-                t0 = clock()
-                pydicom.dcmread(file).pixel_array  # noqa: B018
-                t1 = clock()
-                slice_ = record.load()
-                t3 = clock()
-                result = pipeline.track_slice(i, slice_, tracker, scale=None, segmentation=segmentation)
-                t4 = clock()
-                sinks.write(result)
-                t5 = clock()
-                for name, seconds in (("pydicom", t1 - t0), ("pixels", t3 - t1), ("track", t4 - t3), ("row", t5 - t4)):
-                    stages.note(name, i, seconds)
-        t0 = clock()
-        open_images([files[0].parent])
-        header = (clock() - t0) / len(files)
-        for i in range(len(files)):
-            stages.note("header", i, header)
-    return stages
-
-
-def time_segmentation(files: list[Path], model: RodModel, repeats: int) -> float:
-    """The share of ``track`` that measures spots, ms a slice."""
-    spent = Stages(len(files))
     measure = pipeline.measure_spots
-    current = 0
+    spent = 0.0
 
     def timed(*arguments: object, **named: object) -> object:
-        t0 = time.perf_counter()
+        nonlocal spent
+        began = clock()
         found = measure(*arguments, **named)  # type: ignore[arg-type]
-        spent.note("segment", current, time.perf_counter() - t0)
+        spent += clock() - began
         return found
 
     pipeline.measure_spots = timed  # type: ignore[assignment]
     try:
         for _ in range(repeats):
             tracker = Tracker(model)
-            for current, record in enumerate(open_images([files[0].parent]).records):
-                pipeline.track_slice(current, record.load(), tracker, scale=None, segmentation=SegmentationOptions())
+            t0 = clock()
+            series = open_images([files[0].parent])
+            header = (clock() - t0) / len(files)
+            with open_sinks(["-"], results_encoding(ResultsHeader(model=model)), io.StringIO()) as sinks:
+                for i, (file, record) in enumerate(zip(files, series.records, strict=True)):
+                    spent = 0.0
+                    t0 = clock()
+                    pydicom.dcmread(file).pixel_array  # noqa: B018
+                    t1 = clock()
+                    slice_ = record.load()
+                    t2 = clock()
+                    result = pipeline.track_slice(i, slice_, tracker, scale=None, segmentation=segmentation)
+                    t3 = clock()
+                    sinks.write(result)
+                    t4 = clock()
+                    stages.note("pydicom", i, t1 - t0)
+                    stages.note("header", i, header)
+                    stages.note("pixels", i, t2 - t1)
+                    stages.note("spots", i, spent)
+                    stages.note("tracker", i, t3 - t2 - spent)
+                    stages.note("row", i, t4 - t3)
     finally:
         pipeline.measure_spots = measure
-    return spent.mean_ms("segment")
+    return stages
 
 
 def naive(file: Path, model: RodModel, T: np.ndarray) -> np.ndarray:
@@ -191,15 +184,12 @@ def main() -> None:
         folder = a.folder or simulated(Path(temporary), a.slices)
         files = [folder / record.info.source for record in open_images([folder]).records]
         stages = time_stages(files, model, a.repeats)
-        segment = time_segmentation(files, model, a.repeats)
         reference = stages.mean_ms("pydicom")
-        split = {name: stages.mean_ms(name) for name in ("header", "pixels", "track", "row")}
+        split = {name: stages.mean_ms(name) for name in ("header", "pixels", "spots", "tracker", "row")}
         total = sum(split.values())
         print(f"{len(files)} slices; pydicom dcmread().pixel_array {reference:.2f} ms")
         for name, ms in split.items():
             print(f"  {name:8} {ms:6.2f} ms  {ms / reference:5.2f}")
-            if name == "track":
-                print(f"    of that spots {segment:6.2f} ms, tracker {ms - segment:6.2f} ms")
         print(
             f"  all      {total:6.2f} ms, {1e3 / total:.0f} slices/s: {total / reference:.2f} × pydicom (goal {GOAL:g})"
         )
