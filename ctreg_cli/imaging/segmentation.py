@@ -21,7 +21,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, joined, measure_blobs, measure_lone_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
 from ctreg_cli.imaging.maxima import local_maxima, smoothed
-from ctreg_cli.imaging.peaks import COARSE_PX, Peaks, image_noise, large_regions, maxima_above, rate_peaks
+from ctreg_cli.imaging.peaks import BLOCK_PX, COARSE_PX, Peaks, image_noise, large_regions, maxima_above, rate_peaks
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.imaging.window import UprightImage, grid
@@ -141,9 +141,9 @@ def _with_large_regions(spots: Spots, image: UprightImage, smooth: NDArray[Any],
     seen = np.vstack([spots.uv_px, *([[r.u_px, r.v_px]] for r in spots.rejected)])
     inside = np.all((seen >= boxes[:, None, :2]) & (seen <= boxes[:, None, 2:]), axis=2)
     unseen = boxes[~np.any(inside, axis=1)]
-    rejections = _Rejections(spots=list(spots.rejected))
+    rejections = _Rejections()
     rejections.add(0.5 * (unseen[:, :2] + unseen[:, 2:]), "too_large")
-    return replace(spots, rejected=tuple(rejections.spots))
+    return replace(spots, rejected=(*rejections.spots, *spots.rejected))
 
 
 def _measure(
@@ -261,13 +261,21 @@ def _blobs_at(
     """Blobs at ``peaks`` that could be spots, in groups of one size of window."""
     peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
     large = peaks.half_width > 0.5 * limits.width_px + 1.0
-    rejections.add(peaks.pixels[large], "too_large")
+    rejections.add(_one_a_block(peaks.pixels[large]), "too_large")
     peaks = peaks.take(~large)
     least = SMOOTHING_LOSS * options.min_relative_contrast * peaks.contrast.max(initial=0.0)
     faint = (peaks.contrast < least) | (np.arange(len(peaks.pixels)) >= PEAKS_PER_SPOT * options.max_spots)
     groups = _blobs(image, peaks.pixels[~faint], limits, rejections)
     rejections.add(peaks.pixels[faint], "low_contrast")
     return groups
+
+
+def _one_a_block(pixels: IntArray) -> IntArray:
+    """Of many peaks (k, 2) on one large thing, one in each block of the image."""
+    if not len(pixels):
+        return pixels
+    _, first = np.unique(pixels // BLOCK_PX, axis=0, return_index=True)
+    return pixels[np.sort(first)]
 
 
 def _spots_of(
