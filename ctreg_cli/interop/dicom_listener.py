@@ -49,7 +49,7 @@ _COMPRESSED = (
 )
 
 # PS3.4 B.2.3: what the sender is told
-SUCCESS, OUT_OF_RESOURCES, CANNOT_UNDERSTAND = 0x0000, 0xA700, 0xC000
+SUCCESS, OUT_OF_RESOURCES, CANNOT_UNDERSTAND, PROCESSING_FAILURE = 0x0000, 0xA700, 0xC000, 0x0110
 
 _MEMORY_FOLDER = Path("/dev/shm")
 #: SOP instances remembered, to know again what is sent a second time
@@ -132,23 +132,20 @@ class DicomListener:
         """Stop listening; whoever is connected is cut off."""
         self.slices.close()
         self._server.shutdown()
-        for association in self._server.active_associations:
-            association.abort()
         self._thread.join(5)
         self._scratch.cleanup()
 
     def _start(self) -> Any:
         from pynetdicom import _config, evt
-        from pynetdicom.ae import ApplicationEntity
 
-        from ctreg_cli.interop.dicom_server import GuardedServer
+        from ctreg_cli.interop.dicom_server import GuardedServer, ListeningEntity
 
         _config.LOG_HANDLER_LEVEL = "none"  # pynetdicom's own log would quote the peers
         options = self.options
         for title in (options.ae_title, *options.allowed):
             if not _AE_TITLE.fullmatch(title):
                 raise InputError(f"{title!r} is no AE title: up to 16 printable ASCII characters, no backslash")
-        entity = ApplicationEntity(ae_title=options.ae_title)
+        entity = ListeningEntity(ae_title=options.ae_title)
         entity.require_called_aet = True
         entity.require_calling_aet = list(options.allowed)
         entity.maximum_associations = options.max_associations
@@ -197,6 +194,9 @@ class DicomListener:
         try:
             status = self._take(path)
             taken = status == SUCCESS
+        # one image on which the reader breaks shall not end the session; its sender is told
+        except Exception:  # noqa: BLE001
+            status = self._refuse("internal error", PROCESSING_FAILURE)
         finally:
             if self.options.keep is None or not taken:
                 path.unlink(missing_ok=True)

@@ -2,16 +2,19 @@
 
 Import it only where pynetdicom is installed. What is added: no message unit larger than agreed is waited for, none may
 take for ever, no association may send more for one image than an image has, TLS peers shake hands in a thread of their
-own, and connections beyond those that could become associations are closed at once.
+own, and peers that connect and then say nothing keep nobody out: of too many such the oldest is cut off.
 """
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import ssl
+import threading
 import time
 from typing import Any
 
+from pynetdicom.ae import ApplicationEntity
 from pynetdicom.transport import (
     AssociationServer,
     AssociationSocket,
@@ -21,8 +24,8 @@ from pynetdicom.transport import (
 
 #: of requests for associations; longer ones name more than anyone needs
 MAX_CONTROL_PDU_BYTES = 1 << 20
-#: connections beyond the number of associations, that are told so by the protocol; more are just closed
-SPARE_CONNECTIONS = 16
+#: connections that may stand without having asked for an association yet
+MAX_UNASSOCIATED = 16
 _CHUNK_BYTES = 1 << 16
 _PDU_HEADER_BYTES = 6
 
@@ -68,6 +71,15 @@ class GuardedSocket(AssociationSocket):
         connection.settimeout(self.pdu_timeout_s)
         return data[:place]
 
+    def _shutdown_socket(self) -> None:
+        """Close; whoever still waits for the peer to ask for an association need not do so until time is over."""
+        connection = self.socket
+        super()._shutdown_socket()
+        if connection is not None:
+            connection.close()
+        if not self.assoc.is_established:
+            self.assoc.dul.to_user_queue.put(None)
+
 
 class _Handler(RequestHandler):
     """Gives every association a guarded socket."""
@@ -80,6 +92,24 @@ class _Handler(RequestHandler):
         limited: type[GuardedSocket] = self.server.socket_class  # type: ignore[attr-defined]
         association.set_socket(limited(association, client_socket=self.request))
         return association
+
+
+class ListeningEntity(ApplicationEntity):
+    """Counts as associations only those that are, so that the limit on them is one on senders."""
+
+    @property
+    def active_associations(self) -> list[Any]:
+        """Those established, and the one that is asking for the list."""
+        asking = threading.current_thread()
+        return [one for one in super().active_associations if one.is_established or one is asking]
+
+
+def _cut_off(association: Any) -> None:
+    """End a connection from this side; its own threads then see that it has ended, and go."""
+    connection = getattr(association.dul.socket, "socket", None)
+    if connection is not None:
+        with contextlib.suppress(OSError):  # it has gone by itself
+            connection.shutdown(socket.SHUT_RDWR)
 
 
 class GuardedServer(ThreadedAssociationServer):
@@ -119,16 +149,25 @@ class GuardedServer(ThreadedAssociationServer):
         return connection, address
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Whether there is room for another thread."""
-        return len(self.active_associations) < self.ae.maximum_associations + SPARE_CONNECTIONS
+        """Make room for another thread; whether there is any."""
+        waiting = [association for association in self.active_associations if not association.is_established]
+        for oldest in waiting[: max(0, len(waiting) + 1 - MAX_UNASSOCIATED)]:
+            _cut_off(oldest)
+        # those cut off need a moment to go: a flood of connections meets a wall
+        return len(waiting) < 2 * MAX_UNASSOCIATED
 
     def service_actions(self) -> None:
         """Nothing: the full garbage collection that would be here takes longer than a slice may."""
 
     def shutdown(self) -> None:
-        """Stop accepting, and close."""
+        """Stop accepting, and end every connection."""
         super(AssociationServer, self).shutdown()
         self.server_close()
+        for association in self.active_associations:
+            if association.is_established:
+                association.abort()
+            else:
+                _cut_off(association)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that fails at once is closed, and that is all."""

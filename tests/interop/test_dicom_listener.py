@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
 import struct
@@ -10,6 +9,7 @@ import subprocess
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +18,9 @@ pytest.importorskip("pynetdicom")
 
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.slice import Slice, UnreadableSlice
+from ctreg_cli.interop import dicom_listener
 from ctreg_cli.interop.dicom_listener import DicomListener, ListenOptions
+from ctreg_cli.interop.dicom_server import MAX_UNASSOCIATED
 from ctreg_cli.io.images import read_slices
 
 from .senders import LIMIT_S, SLICES, listening, needs_storescu, storescu
@@ -130,22 +132,43 @@ def test_rate_is_limited() -> None:
     assert 2 <= len(received.slices) <= 5
 
 
-def test_a_full_disk_is_told_to_the_sender_and_survived(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = Path.open
-    full = True
-
-    def open_(self: Path, mode: str = "r", *arguments: object, **options: object) -> object:
-        if full and mode == "xb":
-            raise OSError(28, "No space left on device")
-        return real(self, mode, *arguments, **options)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(Path, "open", open_)
-    with listening() as (listener, received):
-        done = storescu(listener.port, SLICES[0])
+def test_a_full_disk_is_told_to_the_sender_and_survived(tmp_path: Path) -> None:
+    """The system itself refuses to let files grow: half a slice fits."""
+    resource = pytest.importorskip("resource")
+    size = SLICES[0].stat().st_size
+    kept = tmp_path / "kept"
+    _, most = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with listening(keep=kept) as (listener, received):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, most))
+        try:
+            done = storescu(listener.port, SLICES[0])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert "OutOfResources" in done.stderr + done.stdout
-        full = False
+        assert listener.left_out == {"cannot be written to disk": 1}
+        assert list(kept.iterdir()) == []
         assert still_works(listener)
     assert len(received.slices) == 1
+
+
+def test_an_image_on_which_the_reader_breaks_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = dicom_listener.read_image_file
+    breaks = [True]
+
+    def read(path: Path, source: str) -> Any:
+        if breaks.pop():
+            breaks.append(False)
+            raise ZeroDivisionError
+        breaks.append(False)
+        return real(path, source)
+
+    monkeypatch.setattr(dicom_listener, "read_image_file", read)
+    with listening() as (listener, received):
+        done = storescu(listener.port, SLICES[0], SLICES[1])
+        assert "0x110" in done.stderr + done.stdout
+        assert listener.left_out == {"internal error": 1}
+        assert still_works(listener)
+    assert len(received.slices) >= 1
 
 
 def test_what_cannot_be_read_is_told_and_becomes_a_row(tmp_path: Path) -> None:
@@ -177,27 +200,57 @@ def is_closed(connection: socket.socket) -> bool:
     return True
 
 
-def test_bad_peers_are_closed_and_good_ones_served() -> None:
+#: starts of what peers send that mean no good; the rest never comes
+CLAIMS = {
+    "4 GB for a request": struct.pack(">BBL", 1, 0, 2**32 - 1) + bytes(1000),
+    "4 GB of data": struct.pack(">BBL", 4, 0, 2**32 - 1) + bytes(1000),
+}
+BROKEN_OFF = {
+    "nothing": b"",
+    "half a header": b"\x01\x00\x00",
+    "a quarter of a request": struct.pack(">BBL", 1, 0, 200) + bytes(50),
+}
+
+
+@pytest.mark.parametrize("said", CLAIMS.values(), ids=list(CLAIMS))
+def test_what_no_peer_may_say_ends_the_connection_at_once(said: bytes) -> None:
+    """Not when the patience for a message unit is over: that is a minute here."""
+    with listening(pdu_timeout_s=60.0) as (listener, received):
+        peer = raw(listener)
+        peer.sendall(said)
+        peer.settimeout(5)
+        assert is_closed(peer)
+        peer.close()
+        assert still_works(listener)
+    assert len(received.slices) == 1
+
+
+def test_ten_thousand_random_bytes() -> None:
     with listening() as (listener, received):
-        garbage = raw(listener)
-        garbage.sendall(os.urandom(10_000))
-        huge = raw(listener)
-        huge.sendall(struct.pack(">BBL", 1, 0, 2**32 - 1) + bytes(1000))  # claims 4 GB
-        huge_data = raw(listener)
-        huge_data.sendall(struct.pack(">BBL", 4, 0, 2**32 - 1) + bytes(1000))
+        for first in (0, 1, 2, 4, 5, 7, 255):
+            peer = raw(listener)
+            peer.sendall(bytes([first]) + np.random.default_rng(first).bytes(9999))
+            peer.settimeout(10)
+            assert is_closed(peer)
+            peer.close()
+        assert still_works(listener)
+    assert len(received.slices) == 1
+
+
+def test_half_open_peers_are_closed_in_time_and_hold_up_nobody() -> None:
+    with listening() as (listener, received):
+        peers = []
+        for said in BROKEN_OFF.values():
+            peers.append(raw(listener))
+            peers[-1].sendall(said)
         truncated = raw(listener)
-        truncated.sendall(struct.pack(">BBL", 1, 0, 200) + bytes(50))
+        truncated.sendall(BROKEN_OFF["a quarter of a request"])
         truncated.shutdown(socket.SHUT_WR)
-        half = raw(listener)
-        half.sendall(b"\x01\x00\x00")  # and then nothing
-        stalled = raw(listener)
-        stalled.sendall(struct.pack(">BBL", 1, 0, 200) + bytes(50))  # and then nothing
-        silent = raw(listener)
         gone = raw(listener)
         gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         gone.close()
         assert still_works(listener)
-        for connection in (garbage, huge, huge_data, truncated, half, stalled, silent):
+        for connection in (*peers, truncated):
             connection.settimeout(10)
             assert is_closed(connection)
             connection.close()
@@ -206,23 +259,38 @@ def test_bad_peers_are_closed_and_good_ones_served() -> None:
 
 
 def test_fifty_connections_at_once() -> None:
-    """They are closed when they say nothing, and as many senders as are allowed are then served side by side."""
-    with listening(max_associations=4, pdu_timeout_s=2.0) as (listener, received):
+    """They say nothing for a minute; senders are served meanwhile, as many at a time as are allowed."""
+    with listening(max_associations=4, pdu_timeout_s=60.0) as (listener, received):
         crowd = [raw(listener) for _ in range(50)]
-        for connection in crowd:
-            connection.settimeout(10)
-            assert is_closed(connection)
-            connection.close()
-        end = time.monotonic() + 10
-        while listener._server.active_associations and time.monotonic() < end:
-            time.sleep(0.01)
+        assert still_works(listener)
+        assert len(listener._server.active_associations) <= MAX_UNASSOCIATED + 1
         senders = [threading.Thread(target=storescu, args=(listener.port, path)) for path in SLICES[:4]]
         for sender in senders:
             sender.start()
         for sender in senders:
             sender.join(LIMIT_S)
-        assert still_works(listener)
+        for connection in crowd:
+            connection.close()
     assert len(received.slices) == 5
+
+
+def test_more_senders_than_allowed_are_told() -> None:
+    from pynetdicom.ae import ApplicationEntity
+
+    entity = ApplicationEntity(ae_title="SCANNER")
+    entity.add_requested_context("1.2.840.10008.1.1")
+    with listening(max_associations=2) as (listener, _):
+        held = [entity.associate("127.0.0.1", listener.port, ae_title="CTREG") for _ in range(2)]
+        assert all(association.is_established for association in held)
+        assert entity.associate("127.0.0.1", listener.port, ae_title="CTREG").is_rejected
+        held[0].release()
+        end = time.monotonic() + 10
+        while len(listener._server.active_associations) > 1 and time.monotonic() < end:
+            time.sleep(0.01)
+        again = entity.associate("127.0.0.1", listener.port, ae_title="CTREG")
+        assert again.is_established
+        again.release()
+        held[1].release()
 
 
 def test_an_image_that_is_too_large_is_cut_off() -> None:
