@@ -36,6 +36,8 @@ LEFT_OUT = 1e-12
 MIN_CLIPPED_PX = 3
 #: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
 MODEL_SD_PX = 0.005
+#: and what a spot that is cut off costs beside: only its sides are fitted, two pixels wide where it is sharp
+CLIPPED_SD_PX = 0.008
 #: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
@@ -104,7 +106,7 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     covariance = centre_covariance(
         in_pixels(parameters, influence), blobs.radius, smooth=(smooth, length), rough=rough, structure=structure
     )
-    covariance += MODEL_SD_PX**2 * np.eye(2)
+    covariance += (MODEL_SD_PX**2 + CLIPPED_SD_PX**2 * (n_clipped > 0))[:, None, None] * np.eye(2)
     uv = centre.T
     away = ((uv - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
