@@ -13,7 +13,7 @@ MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
 #: range of ln β: from tails heavier than a Gaussian's to nearly a box
 LOG_BETA_RANGE = (-0.5, 1.5)
 #: Levenberg–Marquardt damping; a step that is small only because of much damping does not end the fit
-FIRST_DAMPING, DAMPING_FACTOR, DONE_DAMPING = 1e-4, 10.0, 1e-2
+FIRST_DAMPING, DAMPING_FACTOR, DONE_DAMPING = 1e-3, 10.0, 1e-2
 
 
 def _per_parameter(*, centre: float, log_height: float, background: float, shape: float, log_beta: float) -> FloatArray:
