@@ -92,7 +92,7 @@ def errors(T: np.ndarray, frame: OracleFrame, world: OracleScene) -> tuple[float
 def bound_sds(frame: OracleFrame, world: OracleScene) -> tuple[float, float]:
     """Square roots of the bound on the mean square rotation and position error (rad, mm)."""
     centre = world.R @ (frame.starts + frame.ends).mean(axis=0) / 2
-    G = np.hstack([np.eye(3), np.cross(np.eye(3), centre)])
+    G = np.hstack([np.eye(3), -np.cross(np.eye(3), centre)])
     return math.sqrt(np.trace(world.bound[3:, 3:])), math.sqrt(np.trace(G @ world.bound @ G.T))
 
 

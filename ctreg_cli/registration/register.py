@@ -55,7 +55,9 @@ _WORTH_SAYING = 1e-3
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
 #: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is; widened otherwise, but no
 #: more than so many times; and how far, in sd², the valley may bend on the way
-_STRAIGHT_RISE, _MOST_WIDENED, _PROFILE_POINTS, _STRAIGHT_BEND2 = 5.4, 1.6, 5, 9.0
+_STRAIGHT_RISE, _MOST_WIDENED, _PROFILE_POINTS, _STRAIGHT_BEND2 = 5.4, 1.6, 6, 9.0
+#: a truth that costs no more χ² than this must not find the pose wrong by RIVAL_SD of *its* sd
+_PLAUSIBLE_RISE = 7.0
 #: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
 _LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
 #: matches below which nothing can be checked: three spots always fit
@@ -483,23 +485,22 @@ def widen_where_curved(
     values, vectors = np.linalg.eigh(best.covariance / best.inflation**2 * (unit[:, None] * unit))
     axes = vectors / unit[:, None]
     sd = math.sqrt(max(float(values[-1]), 0.0))
-    rise, offset, surprise = _profile(model, scene, best, axes, 3 * sd * np.array([1.0, -1.0]))
-    bend2 = ((offset @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
-    if float(surprise.max()) > RIVAL_SD:
+    inward = np.linspace(3, 0, _PROFILE_POINTS, endpoint=False)
+    rise, offset, surprise = _profile(model, scene, best, axes, sd * np.concatenate([inward, -inward]))
+    if float(np.where(rise <= _PLAUSIBLE_RISE, surprise, 0).max()) > RIVAL_SD:
         return None, math.inf
-    if float(rise.min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
+    ends = np.array([0, len(inward)])
+    bend2 = ((offset[ends] @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
+    if float(rise[ends].min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
         return best, 1.0
     factors = np.linspace(1, _MOST_WIDENED, _PROFILE_POINTS)
     rise, offset, surprise = _profile(model, scene, best, axes, 3 * sd * np.concatenate([factors, -factors]))
     risen = np.maximum.accumulate(rise.reshape(2, -1), axis=1) >= 9
-    if not risen.any(axis=1).all():
+    if not risen.any(axis=1).all() or float(np.where(rise <= _PLAUSIBLE_RISE, surprise, 0).max()) > RIVAL_SD:
         return None, math.inf
     ends = risen.argmax(axis=1)
-    rows = ends + [0, len(factors)]
-    if float(surprise[rows].max()) > RIVAL_SD:
-        return None, math.inf
     # the valley may bend: the ellipsoid has to reach its ends where they are, not where its axis points
-    reach, straight = offset[rows] / 3, axes[:, -1] * sd
+    reach, straight = offset[ends + [0, len(factors)]] / 3, axes[:, -1] * sd
     spread = reach.T @ reach / 2 - np.outer(straight, straight)
     covariance = best.covariance + best.inflation**2 * _positive_part(spread)
     return replace(best, covariance=frozen(covariance, (6, 6))), float(factors[ends].max())
