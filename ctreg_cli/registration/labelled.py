@@ -19,6 +19,7 @@ from ctreg_cli.errors import InputError, SingularGeometryError
 from ctreg_cli.geometry.projection import project, within_bounds
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.linear import LinearSolutions, solve_labelled
+from ctreg_cli.registration.linearity import covariance_along_the_valley
 from ctreg_cli.registration.minimal import RodTriples, solve_three
 from ctreg_cli.registration.refine import (
     Observations,
@@ -62,7 +63,8 @@ def register_labelled(
         scale: mm per pixel; None: estimated along (``Candidate.scale``), from four spots on.
 
     Returns:
-        The minima that cut every labelled rod between its ends; empty where there are none (wrong labels).
+        The minima that cut every labelled rod between its ends; empty where there are none (wrong labels). Check
+        ``Candidate.linear``: where it is False the covariance is smaller than what the spots leave open.
 
     Raises:
         InputError: ``rod_index`` does not fit the spots or the model, or names a rod twice.
@@ -80,6 +82,8 @@ def register_labelled(
     else:
         found = [_fit_scales(part, T, s, uv, covariance) for T, s in zip(starts.T, starts.mm_per_px, strict=True)]
     found = _distinct(part, [candidate for candidate in found if _cuts_its_rods(part, candidate)])
+    if scale:
+        found = [_with_true_covariance(part, candidate, uv, covariance, scale) for candidate in found]
     if found and all(_condition(part, candidate) > _SINGULAR_CONDITION for candidate in found):
         raise SingularGeometryError("these spots leave the pose undetermined: there is a direction that moves none")
     whole = []
@@ -139,6 +143,23 @@ def _fit_poses(model: RodModel, T: FloatArray, uv: FloatArray, covariance: Float
         _candidate(T[r], C[r], fit.residual_px[r], fit.lambda_mm[r], float(fit.chi2[r]), 2 * len(uv) - 6, steps)
         for r in np.nonzero(np.isfinite(fit.chi2))[0]
     ]
+
+
+def _with_true_covariance(
+    model: RodModel, candidate: Candidate, uv: FloatArray, covariance: FloatArray, scale: Scale
+) -> Candidate:
+    """The candidate, its covariance widened or disowned (``linear``) where the cost is no ellipsoid."""
+    if candidate.degrees_of_freedom <= 0:
+        return candidate
+    seen = Observations(
+        uv_px=uv[None], covariance_px=covariance[None], matched=np.ones((1, len(uv)), bool), mm_per_px=scale.mm_per_px
+    )
+    widened, _ = covariance_along_the_valley(
+        model, candidate.T_slice_model, candidate.covariance, seen, inflation=candidate.inflation
+    )
+    if widened is None:
+        return replace(candidate, linear=False)
+    return replace(candidate, covariance=frozen(widened, (6, 6)))
 
 
 def _fit_scales(model: RodModel, T: FloatArray, s: FloatArray, uv: FloatArray, covariance: FloatArray) -> Candidate:

@@ -36,7 +36,6 @@ from ctreg_cli.registration.refine import (
     Observations,
     covariance_from_information,
     invert_2x2,
-    linearise,
     refine,
 )
 from ctreg_cli.rods import RodModel
@@ -421,7 +420,9 @@ def _vote(
     r = np.where(hopeful[..., None], scene.xy_mm[nearest] - projection.xy_mm[row, others], 0)
     det = np.maximum(gate[..., 0, 0] * gate[..., 1, 1] - gate[..., 0, 1] ** 2, 1e-300)
     distance2 = (
-        gate[..., 1, 1] * r[..., 0] ** 2 - 2 * gate[..., 0, 1] * r[..., 0] * r[..., 1] + gate[..., 0, 0] * r[..., 1] ** 2
+        gate[..., 1, 1] * r[..., 0] ** 2
+        - 2 * gate[..., 0, 1] * r[..., 0] * r[..., 1]
+        + gate[..., 0, 0] * r[..., 1] ** 2
     ) / det
     spread = np.sqrt(det)
     votes = hopeful & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
@@ -485,9 +486,7 @@ def visibility(
 def verify(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int) -> Matches | None:
     """Refine hypotheses on their spots, let all spots vote again with the smaller covariance, refine, weigh."""
     for iterations in _VERIFY_STEPS:
-        T, fit, _ = refine(
-            model, T, observations(scene, spot_of_rod), iterations=iterations, step_tolerance=1e-3
-        )
+        T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=iterations, step_tolerance=1e-3)
         spot_of_rod = assign(model, scene, T, fit)
         enough = ((spot_of_rod >= 0).sum(axis=1) >= least_matches) & np.isfinite(fit.chi2)
         T, spot_of_rod = T[enough], spot_of_rod[enough]
@@ -661,16 +660,14 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
     # most of the starts are far off and say so at once, most of the others after a few steps
     for most, iterations in ((60, 3), (16, 6)):
-        T, fit, _ = refine(
-            model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3
-        )
+        T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
         T = T[np.argsort(fit.chi2, kind="stable")[:most]]
         T = T[_distinct_poses(model, T)]
     return weigh(model, scene, T[:8], np.array(same[: min(len(T), 8)]), least_matches)
 
 
 def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:
-    """Indices of poses (b, 4, 4) that differ by more than half a degree or a fiftieth of the frame, first come first."""
+    """Indices of poses (b, 4, 4) that differ by half a degree or a fiftieth of the frame, first come first."""
     R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
     turned = R @ R.T < 3 - 0.01**2  # trace(R_i R_jᵀ) = 1 + 2 cos
     moved = np.linalg.norm(t[:, None] - t[None], axis=-1) > 0.02 * model.size_mm

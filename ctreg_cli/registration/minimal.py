@@ -84,9 +84,7 @@ class RodTriples:
         q3, D3 = quadratic(p[:, 2] - p[:, 0], y[:, 2])
         gap, cosine = p[:, 1] - p[:, 2], dot(y[:, 1], y[:, 2])  # P₂ − P₃ = gap + q₂ y₂ − q₃ y₃ without the roots
         along_2, along_3 = dot(gap, y[:, 1]), dot(gap, y[:, 2])
-        distance2 = (
-            dot(gap, gap) + q2**2 + q3**2 + 2 * (q2 * along_2 - q3 * along_3) - 2 * cosine * q2 * q3
-        )
+        distance2 = dot(gap, gap) + q2**2 + q3**2 + 2 * (q2 * along_2 - q3 * along_3) - 2 * cosine * q2 * q3
         return Quadratics(
             q2=q2,
             q3=q3,
@@ -219,7 +217,7 @@ def scan_three(
         share = f0 / (f0 - f1)
         found.append((h, at[h, k] + share * (at[h, k + 1] - at[h, k]), s2, s3))
         # the least of |F| among its neighbours, where no sign change says more
-        h, k = np.nonzero((F <= limit) & (F >= -limit) & real)
+        h, k = np.nonzero((limit >= F) & (-limit <= F) & real)
         before, after = np.maximum(k - 1, 0), np.minimum(k + 1, samples - 1)
         size = np.abs(F[h, k])
         dip = (size <= np.abs(F[h, before])) & (size <= np.abs(F[h, after]))

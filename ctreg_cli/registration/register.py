@@ -14,12 +14,13 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.integrity import protection_levels
+from ctreg_cli.registration.linearity import covariance_along_the_valley, positive_part
 from ctreg_cli.registration.matching import Matches, Scene, doubt, observations, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import (
     Linearisation,
+    Observations,
     covariance_from_information,
-    linearise,
     refine,
 )
 from ctreg_cli.registration.result import Candidate, Registration
@@ -53,11 +54,6 @@ _WORTH_SAYING = 1e-3
 #: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
 #: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
-#: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is; widened otherwise, but no
-#: more than so many times; and how far, in sd², the valley may bend on the way
-_STRAIGHT_RISE, _MOST_WIDENED, _PROFILE_POINTS, _STRAIGHT_BEND2 = 5.4, 1.6, 6, 9.0
-#: a truth that costs no more χ² than this must not find the pose wrong by RIVAL_SD of *its* sd
-_PLAUSIBLE_RISE = 7.0
 #: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
 _LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
 #: matches below which nothing can be checked: three spots always fit
@@ -149,17 +145,22 @@ def register(
 
 def protected(model: RodModel, scene: Scene, best: Candidate, options: RegistrationOptions) -> Candidate:
     """The candidate with its protection levels."""
-    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
-    spot_of_rod[0, best.rod_index] = best.spot_index
     level = protection_levels(
         model,
         best.T_slice_model,
         best.covariance,
-        observations(scene, spot_of_rod),
+        _seen_by(model, scene, best),
         options.integrity_risk,
         inflation=best.inflation,
     )
     return replace(best, protection_mm=frozen(level, (None,)))
+
+
+def _seen_by(model: RodModel, scene: Scene, candidate: Candidate) -> Observations:
+    """The one hypothesis of a candidate's matches."""
+    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
+    spot_of_rod[0, candidate.rod_index] = candidate.spot_index
+    return observations(scene, spot_of_rod)
 
 
 def _log_others(matches: Matches) -> float:
@@ -222,14 +223,18 @@ def decide(
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
-    widened, factor = widen_where_curved(model, scene, matches, best)
-    if widened is None:
+    covariance, factor = covariance_along_the_valley(
+        model, best.T_slice_model, best.covariance, _seen_by(model, scene, best), inflation=best.inflation
+    )
+    if covariance is None:
         return Registration(
             status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
         )
-    if widened is not best:
-        best = widened
-        warnings.append(("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times"))
+    if covariance is not best.covariance:
+        best = replace(best, covariance=frozen(covariance, (6, 6)))
+        warnings.append(
+            ("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times")
+        )
     best, share = averaged(best, doubts)
     if share > _WORTH_SAYING:
         warnings.append(
@@ -435,14 +440,8 @@ def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float
         delta = poses.difference(c.T_slice_model, best.T_slice_model)
         covariance += weight * (c.covariance + np.outer(delta, delta))
     # never narrower than the match itself says
-    widened = best.covariance + _positive_part(covariance / total - best.covariance)
+    widened = best.covariance + positive_part(covariance / total - best.covariance)
     return replace(best, covariance=frozen(widened, (6, 6))), float(weights.sum()) / total
-
-
-def _positive_part(M: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(M)
-    result: FloatArray = (vectors * np.maximum(values, 0)) @ vectors.T
-    return result
 
 
 def pose_distance_sd(a: Candidate, b: Candidate) -> float:
@@ -467,69 +466,3 @@ def weakness(model: RodModel, covariance: FloatArray) -> str:
         kind = "rotation in the slice plane" if axis == "z" else f"tilt about {axis}"
         return f"{kind} is known to {angle:.2g} deg only"
     return f"position along {axis} is known to {sd:.2g} mm only"
-
-
-def widen_where_curved(
-    model: RodModel, scene: Scene, matches: Matches, best: Candidate
-) -> tuple[Candidate | None, float]:
-    """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
-
-    Where it rises less, or its valley bends out of the ellipsoid, the profile is followed outward until it has risen by
-    the 9 that three sd must cost, and the covariance is made to reach both ends.
-
-    Returns the candidate and the factor (1 when all is well), or None where no ellipsoid describes what is known: the
-    profile stays flat for more than :data:`_MOST_WIDENED` times the sd, or the truth may lie where the spots say so much
-    more that this pose would be wrong by :data:`RIVAL_SD` of its standard deviations.
-    """
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
-    values, vectors = np.linalg.eigh(best.covariance / best.inflation**2 * (unit[:, None] * unit))
-    axes = vectors / unit[:, None]
-    sd = math.sqrt(max(float(values[-1]), 0.0))
-    inward = np.linspace(3, 0, _PROFILE_POINTS, endpoint=False)
-    rise, offset, surprise = _profile(model, scene, best, axes, sd * np.concatenate([inward, -inward]))
-    if float(np.where(rise <= _PLAUSIBLE_RISE, surprise, 0).max()) > RIVAL_SD:
-        return None, math.inf
-    ends = np.array([0, len(inward)])
-    bend2 = ((offset[ends] @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
-    if float(rise[ends].min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
-        return best, 1.0
-    factors = np.linspace(1, _MOST_WIDENED, _PROFILE_POINTS)
-    rise, offset, surprise = _profile(model, scene, best, axes, 3 * sd * np.concatenate([factors, -factors]))
-    risen = np.maximum.accumulate(rise.reshape(2, -1), axis=1) >= 9
-    if not risen.any(axis=1).all() or float(np.where(rise <= _PLAUSIBLE_RISE, surprise, 0).max()) > RIVAL_SD:
-        return None, math.inf
-    ends = risen.argmax(axis=1)
-    # the valley may bend: the ellipsoid has to reach its ends where they are, not where its axis points
-    reach, straight = offset[ends + [0, len(factors)]] / 3, axes[:, -1] * sd
-    spread = reach.T @ reach / 2 - np.outer(straight, straight)
-    covariance = best.covariance + best.inflation**2 * _positive_part(spread)
-    return replace(best, covariance=frozen(covariance, (6, 6))), float(factors[ends].max())
-
-
-def _profile(
-    model: RodModel, scene: Scene, best: Candidate, axes: FloatArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How much χ² rises (b,) at ``steps`` (b,) along the last of ``axes`` (6, 6) while the others give way.
-
-    Returns the rises; the twists (b, 6) from the pose to where they are reached; and how many standard deviations *of
-    there* the pose is off, in rotation or place (b,): what its error would be called if the truth were there.
-    """
-    b = len(steps)
-    spot_of_rod = np.full((b, len(model)), -1, dtype=np.intp)
-    spot_of_rod[:, best.rod_index] = best.spot_index
-    seen = observations(scene, spot_of_rod)
-    T = poses.update(np.repeat(best.T_slice_model[None], b, axis=0), steps[:, None] * axes[:, -1])
-    basis = axes[:, :-1]
-    for _ in range(5):
-        H, g = linearise(model, T, seen).normal_equations()
-        Hc = basis.T @ H @ basis
-        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
-        T = poses.update(T, np.linalg.solve(Hc, (g @ basis)[..., None])[..., 0] @ basis.T)
-    there = linearise(model, T, seen)
-    rise = there.chi2 - best.chi2
-    offset = poses.difference(T, best.T_slice_model)
-    C, _ = covariance_from_information(there.normal_equations()[0], model.size_mm)
-    variance = np.einsum("bii->bi", C)
-    parts = np.stack([(offset[:, 3 * k : 3 * k + 3] ** 2).sum(axis=1) for k in (0, 1)], axis=1)
-    own = np.stack([variance[:, 3 * k : 3 * k + 3].sum(axis=1) for k in (0, 1)], axis=1)
-    return np.where(np.isfinite(rise), rise, 9.0), offset, np.sqrt((parts / np.maximum(own, 1e-300)).max(axis=1))

@@ -41,6 +41,8 @@ class Candidate:
     log_odds: float
     #: factor by which standard deviations were widened because the spots were worse than believed; 1 when they were not
     inflation: float = 1.0
+    #: False where no covariance describes what is known (see :mod:`ctreg_cli.registration.linearity`)
+    linear: bool = True
     iterations: int = 0
     #: (p,) protection level at each target, or at the frame's centre where it has none, mm; empty when not worked out
     #: (see :mod:`ctreg_cli.registration.integrity`)
