@@ -13,6 +13,8 @@ import argparse
 import contextlib
 import json
 import os
+import shutil
+import signal
 import socket
 import statistics
 import struct
@@ -32,6 +34,7 @@ SERIES = 60
 MEDIAN_LIMIT_MS, P99_LIMIT_MS = 15.0, 40.0
 UID_DIGITS = 20
 INTERVAL_S = 1 / 12
+MEMORY = Path("/dev/shm")
 
 
 class Client:
@@ -124,11 +127,12 @@ def listener(folder: Path, port: int, igtl: int, *options: object) -> Iterator[s
     try:
         yield process
     finally:
-        process.send_signal(2)
+        process.send_signal(signal.SIGINT)
         try:
             print(process.communicate(timeout=20)[1].strip())
         except subprocess.TimeoutExpired:
             process.kill()
+            print("the listener did not end")
 
 
 def latency(n: int, rate_hz: float) -> bool:
@@ -180,39 +184,31 @@ def send(port: int, path: Path) -> float:
 
 
 def soak(n: int) -> bool:
-    """Send n slices over one association, as fast as they are answered; print losses and the listener's memory."""
-    from pydicom import dcmread
-    from pydicom.uid import ExplicitVRLittleEndian
-    from pynetdicom import AE
-
-    with tempfile.TemporaryDirectory() as name:
+    """Send n slices with storescu, an association for every batch; print losses and the listener's memory."""
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as name:
         folder = Path(name)
         slices = templates(folder)
         port, igtl = free_port(), free_port()
         with listener(folder, port, igtl, "--max-rate", 10_000) as process:
             client = Client(igtl)
             time.sleep(0.3)
-            entity = AE(ae_title="SOAK")
-            entity.add_requested_context("1.2.840.10008.5.1.4.1.1.2", ExplicitVRLittleEndian)
-            association = entity.associate("127.0.0.1", port, ae_title="CTREG")
-            from io import BytesIO
-
-            datasets = [dcmread(BytesIO(data)) for data in slices]
             memory: list[float] = []
             start = time.perf_counter()
-            for number in range(n):
-                dataset = datasets[number % len(datasets)]
-                dataset.SOPInstanceUID = _uid(number + 1)
-                dataset.AcquisitionTime = dataset.ContentTime = _time(number)
-                if association.send_c_store(dataset).Status != 0:
-                    print(f"slice {number} was refused")
+            for first in range(0, n, SERIES):
+                batch = folder / "batch"
+                batch.mkdir()
+                for number in range(first, min(first + SERIES, n)):
+                    (batch / f"{number:08d}.dcm").write_bytes(renamed(slices[number % SERIES], number))
+                command = ["storescu", "-aec", "CTREG", "127.0.0.1", str(port), *map(str, sorted(batch.iterdir()))]
+                done = subprocess.run(command, capture_output=True, text=True, check=False)
+                if done.returncode:
+                    print(f"slices from {first} on were refused: {done.stderr.strip()}")
                     return False
-                if number % max(n // 12, 1) == 0:
+                shutil.rmtree(batch)
+                if first // SERIES % max(n // SERIES // 12, 1) == 0:
                     memory.append(resident_mb(process.pid))
-                    print(
-                        f"{number:6d} sent, {len(client.slices):6d} received, listener {memory[-1]:.0f} MB", flush=True
-                    )
-            association.release()
+                    sent = min(first + SERIES, n)
+                    print(f"{sent:6d} sent, {len(client.slices):6d} received, listener {memory[-1]:.0f} MB", flush=True)
             whole = client.wait(n, 60)
             memory.append(resident_mb(process.pid))
             seconds = time.perf_counter() - start

@@ -65,7 +65,9 @@ class PoseTally:
 
     def rows(self) -> list[tuple[str, str]]:
         """Names and values for the table."""
-        rows = [("slices", str(self.total)), ("status", counted(self.outcomes))]
+        rows = [("slices", str(self.total))]
+        if self.outcomes:
+            rows.append(("status", counted(self.outcomes)))
         if self.n_poses:
             rows.append(("residual", f"{statistics.median(self.rms_px):.3g} px rms"))
             sds = f"{statistics.median(self.sd_mm):.2g} mm, {statistics.median(self.sd_deg):.2g}°"

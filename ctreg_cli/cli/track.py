@@ -81,7 +81,7 @@ def track(
     tracking = TrackingOptions(
         registration=registration, jacobian=jacobian.value, gain=gain, prediction=prediction.value
     )
-    session = open_session(inputs or [], model=model, watch=watch, idle=idle, count=count, igtl=igtl)
+    session = open_session(inputs or [], model=model, watch=watch, idle=idle, count=count, igtl=igtl, quiet=quiet)
     run_poses(
         "track",
         lambda slices, frame, mm_per_px, segmentation: (track_live if watch else pipeline.track)(

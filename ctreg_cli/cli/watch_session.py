@@ -12,6 +12,7 @@ from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.cli.run import Watched
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.io.image_files import shown
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.io.sinks import Sink
 from ctreg_cli.io.sources import Source
@@ -74,7 +75,14 @@ class Session:
 
 
 def open_session(
-    inputs: Sequence[str], *, model: str, watch: str | None, idle: float | None, count: int | None, igtl: str | None
+    inputs: Sequence[str],
+    *,
+    model: str,
+    watch: str | None,
+    idle: float | None,
+    count: int | None,
+    igtl: str | None,
+    quiet: bool,
 ) -> Session:
     """What ``--watch`` and ``--igtl`` ask for; before slices may come, all is ready for those of ``model``.
 
@@ -94,6 +102,7 @@ def open_session(
 
         folder = WatchedFolder(Path(watch), WatchOptions(idle_s=idle, count=count))
         warm_up(load_rod_model(model))
+        Talk(quiet=quiet).say(f"watching {shown(Path(watch))}")
         source = Source(slices=Arriving(folder), kind="images")
         remarks.append(lambda: [("skipped", counted(folder.skipped))] if folder.skipped else [])
     if igtl is not None:
@@ -138,7 +147,7 @@ def listening(options: ListenOptions, *, model: str, igtl: str | None, quiet: bo
         sink, remark = open_igtl(igtl)
         sinks.append(sink)
         remarks.append(remark)
-    with DicomListener(options) as listener:
+    with DicomListener(options, lambda reason: talk.warn(f"left out: {reason}")) as listener:
 
         def left_out() -> list[tuple[str, str]]:
             counts = dict(listener.left_out)

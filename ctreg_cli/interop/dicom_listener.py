@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections import Counter, OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -52,6 +53,7 @@ _COMPRESSED = (
 SUCCESS, OUT_OF_RESOURCES, CANNOT_UNDERSTAND, PROCESSING_FAILURE = 0x0000, 0xA700, 0xC000, 0x0110
 
 _MEMORY_FOLDER = Path("/dev/shm")
+SENDER_REFUSED = "sender refused: its title, the title it calls, or too many at once"
 #: SOP instances remembered, to know again what is sent a second time
 _REMEMBERED = 10_000
 _FILE_NAME = re.compile(r"slice_(\d{6,})\.dcm")
@@ -94,16 +96,21 @@ class ListenOptions:
 class DicomListener:
     """Listens while it is a context; :attr:`slices` are the slices as they arrive.
 
+    Args:
+        options: how to listen.
+        on_left_out: told, in a network thread, why an image or a sender was left out, the first time for each reason.
+
     Raises:
         InputError: pynetdicom is not installed, or the address, a title, a certificate or the folder cannot be used.
     """
 
-    def __init__(self, options: ListenOptions) -> None:
+    def __init__(self, options: ListenOptions, on_left_out: Callable[[str], None] = lambda reason: None) -> None:
         optional("pynetdicom", extra="live", what="ctreg listen")
         self.options = options
         self.slices = SliceQueue(options.policy, size=options.queue_size, idle_s=options.idle_s, count=options.count)
-        #: why images were refused or left out → how many
+        #: why images and senders were refused or left out → how many
         self.left_out: Counter[str] = Counter()
+        self._on_left_out = on_left_out
         self._lock = threading.Lock()
         self._order = LiveOrder()
         self._seen: OrderedDict[str, None] = OrderedDict()
@@ -156,7 +163,11 @@ class DicomListener:
         for storage_class in STORAGE_CLASSES:
             entity.add_supported_context(storage_class, syntaxes)
         entity.add_supported_context(VERIFICATION_CLASS)
-        handlers: list[Any] = [(evt.EVT_C_STORE, self._store), (evt.EVT_C_ECHO, _echo)]
+        handlers: list[Any] = [
+            (evt.EVT_C_STORE, self._store),
+            (evt.EVT_C_ECHO, _echo),
+            (evt.EVT_REJECTED, self._rejected),
+        ]
         try:
             return entity.make_server(
                 (options.host, options.port),
@@ -177,26 +188,27 @@ class DicomListener:
         """Take one image; the status its sender is told."""
         _message_done(event)
         if not self._may_come_now():
-            return self._refuse("too many a second", OUT_OF_RESOURCES)
+            return self._leave_out("too many a second", OUT_OF_RESOURCES)
         instance = str(event.request.AffectedSOPInstanceUID)
         with self._lock:
-            if instance in self._seen:  # sent again because our answer was lost: it has been taken
-                self.left_out["sent twice"] += 1
-                return SUCCESS
-            path = self._folder / f"slice_{next(self._numbers):06d}.dcm"
+            again = instance in self._seen
+            number = 0 if again else next(self._numbers)
+        if again:  # because our answer was lost: it has been taken
+            return self._leave_out("sent twice", SUCCESS)
+        path = self._folder / f"slice_{number:06d}.dcm"
         try:
             with path.open("xb") as file:
                 file.write(event.encoded_dataset())
         except OSError:
             path.unlink(missing_ok=True)
-            return self._refuse("cannot be written to disk", OUT_OF_RESOURCES)
+            return self._leave_out("cannot be written to disk", OUT_OF_RESOURCES)
         taken = False
         try:
             status = self._take(path)
             taken = status == SUCCESS
         # one image on which the reader breaks shall not end the session; its sender is told
         except Exception:  # noqa: BLE001
-            status = self._refuse("internal error", PROCESSING_FAILURE)
+            status = self._leave_out("internal error", PROCESSING_FAILURE)
         finally:
             if self.options.keep is None or not taken:
                 path.unlink(missing_ok=True)
@@ -210,24 +222,29 @@ class DicomListener:
     def _take(self, path: Path) -> int:
         records = read_image_file(path, path.name)
         if isinstance(records, str):
-            return self._refuse("not an image", CANNOT_UNDERSTAND)
+            return self._leave_out("not an image", CANNOT_UNDERSTAND)
         slices = [record for record in records if record.series.kind is Kind.SLICE]
         if not slices:
-            self.left_out["localizer or screen capture"] += 1
-            return SUCCESS
+            return self._leave_out("localizer or screen capture", SUCCESS)
         with self._lock:
             placed = arrival_order([self._order.place(record) for record in slices])
         items: list[Slice | UnreadableSlice] = [record.load() for record in placed]
         if not self.slices.put(items, self.options.wait_s):
-            return self._refuse("no room in the queue", OUT_OF_RESOURCES)
+            return self._leave_out("no room in the queue", OUT_OF_RESOURCES)
         if all(isinstance(item, UnreadableSlice) for item in items):
-            return self._refuse("unreadable", CANNOT_UNDERSTAND)
+            return self._leave_out("unreadable", CANNOT_UNDERSTAND)
         return SUCCESS
 
-    def _refuse(self, reason: str, status: int) -> int:
+    def _leave_out(self, reason: str, status: int) -> int:
         with self._lock:
             self.left_out[reason] += 1
+            is_first = self.left_out[reason] == 1
+        if is_first:
+            self._on_left_out(reason)
         return status
+
+    def _rejected(self, _event: Any) -> None:
+        self._leave_out(SENDER_REFUSED, SUCCESS)
 
     def _may_come_now(self) -> bool:
         """A bucket that holds a second's images and fills at the allowed rate."""

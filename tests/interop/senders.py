@@ -57,7 +57,7 @@ class Received:
 
 @contextmanager
 def listening(**options: Any) -> Iterator[tuple[DicomListener, Received]]:
-    chosen: dict[str, Any] = {"port": 0, "policy": "all", "queue_size": 64, "pdu_timeout_s": 1.0}
+    chosen: dict[str, Any] = {"port": 0, "policy": "all", "queue_size": 64}
     with DicomListener(ListenOptions(**(chosen | options))) as listener:
         received = Received(listener)
         yield listener, received
