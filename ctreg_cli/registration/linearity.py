@@ -22,11 +22,11 @@ _STRAIGHT_RISE = 5.4
 #: how far, in sd², the valley may bend on the way
 _STRAIGHT_BEND2 = 9.0
 #: a flatter valley widens the covariance, but no more than so many times
-_MOST_WIDENED = 1.6
+_MOST_WIDENED = 2.5
 #: a truth that costs no more χ² than this must not find the pose wrong by so many of *its* sd
 _PLAUSIBLE_RISE, _WRONG_SD = 7.0, 6.0
 #: points of the profile on each side
-_POINTS = 6
+_POINTS = 8
 
 
 def covariance_along_the_valley(

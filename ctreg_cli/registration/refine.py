@@ -70,14 +70,10 @@ class Linearisation:
         """The hypotheses ``rows`` only."""
         return Linearisation(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
 
-    def replaced(self, rows: IntArray, others: Linearisation) -> Linearisation:
-        """These rows taken from ``others``."""
-        if len(rows) == len(self.chi2):
-            return others
-        fields = {name: np.array(getattr(self, name)) for name in self.__dataclass_fields__}
-        for name, values in fields.items():
-            values[rows] = getattr(others, name)
-        return Linearisation(**fields)
+    def take(self, rows: IntArray, others: Linearisation, chosen: BoolArray) -> None:
+        """Overwrite these rows by the ``chosen`` ones of ``others``, in place: refinement does so at every step."""
+        for name in self.__dataclass_fields__:
+            getattr(self, name)[rows] = getattr(others, name)[chosen]
 
     def normal_equations(self) -> tuple[FloatArray, FloatArray]:
         """Information ``Jᵀ W J`` (b, 6, 6) and gradient ``Jᵀ W r`` (b, 6)."""
@@ -193,7 +189,10 @@ def refine(
         damping[active] = np.where(better, damping[active] * 0.1, np.minimum(damping[active] * 10, 1e8))
         size = np.abs(step / unit).max(axis=1) / model.size_mm
         T[active[better]] = T_new[better]
-        here = here.replaced(active[better], there.subset(better))
+        if len(active) == len(T) and better.all():
+            here = there
+        else:
+            here.take(active[better], there, better)
         active = active[size > step_tolerance]
     return T, here, steps
 
