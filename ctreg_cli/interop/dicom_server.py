@@ -13,6 +13,7 @@ import ssl
 import threading
 import time
 from typing import Any
+from weakref import WeakSet
 
 from pynetdicom.ae import ApplicationEntity
 from pynetdicom.transport import (
@@ -134,6 +135,7 @@ class GuardedServer(ThreadedAssociationServer):
         }
         self.socket_class = type("LimitedSocket", (GuardedSocket,), limits)
         self._pdu_timeout_s = pdu_timeout_s
+        self._cut_off: WeakSet[Any] = WeakSet()
         kwargs["request_handler"] = _Handler
         super().__init__(*args, **kwargs)
 
@@ -150,11 +152,13 @@ class GuardedServer(ThreadedAssociationServer):
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         """Make room for another thread; whether there is any."""
-        waiting = [association for association in self.active_associations if not association.is_established]
+        unassociated = [association for association in self.active_associations if not association.is_established]
+        waiting = [association for association in unassociated if association not in self._cut_off]
         for oldest in waiting[: max(0, len(waiting) + 1 - MAX_UNASSOCIATED)]:
+            self._cut_off.add(oldest)
             _cut_off(oldest)
         # those cut off need a moment to go: a flood of connections meets a wall
-        return len(waiting) < 2 * MAX_UNASSOCIATED
+        return len(unassociated) < 2 * MAX_UNASSOCIATED
 
     def service_actions(self) -> None:
         """Nothing: the full garbage collection that would be here takes longer than a slice may."""
