@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -35,9 +36,13 @@ class Content:
         """Whether every usable slice has a time; else the numbers of the slices stand for seconds, of all of them."""
         return all(record.time_s is not None for record in self.usable)
 
-    def time_s(self, record: SliceRecord) -> float | None:
-        """Seconds; None for a slice that has no time where the usable ones have theirs."""
-        return record.time_s if self.has_times else float(record.index)
+    def timed(self, records: Iterable[SliceRecord]) -> Iterator[tuple[SliceRecord, float]]:
+        """Slices with their seconds; those without a time, where the usable ones have theirs, are left out."""
+        has_times = self.has_times
+        for record in records:
+            time_s = record.time_s if has_times else float(record.index)
+            if time_s is not None:
+                yield record, time_s
 
     @property
     def model_name(self) -> str:

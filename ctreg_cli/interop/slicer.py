@@ -99,7 +99,7 @@ def transform_sequence(content: Content) -> bytes:
     known, has no place in the sequence.
     """
     name = f"ModelTo{'Patient' if content.space == 'patient' else 'Slice'}Transform"
-    records = [record for record in content.document.records if content.time_s(record) is not None]
+    records = list(content.timed(content.document.records))
     usable = set(map(id, content.usable))
     lines = [
         "ObjectType = Image",
@@ -114,7 +114,7 @@ def transform_sequence(content: Content) -> bytes:
         "ElementType = MET_UCHAR",
         "Kinds = domain domain list",
     ]
-    for number, record in enumerate(records):
+    for number, (record, time_s) in enumerate(records):
         field = f"Seq_Frame{number:04d}"
         if id(record) in usable:
             M = RAS_FROM_LPS @ content.pose(record) @ RAS_FROM_LPS
@@ -123,6 +123,6 @@ def transform_sequence(content: Content) -> bytes:
             lines += [line, f"{field}_{name}Status = OK"]
         else:
             lines.append(f"{field}_{name}Status = INVALID")
-        lines.append(f"{field}_Timestamp = {content.time_s(record):.6f}")
+        lines.append(f"{field}_Timestamp = {time_s:.6f}")
     lines.append("ElementDataFile = LOCAL")
     return ("\n".join(lines) + "\n").encode()

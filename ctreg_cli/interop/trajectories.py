@@ -19,10 +19,10 @@ def tum(content: Content) -> bytes:
         f"# pose of the frame {_word(content.model_name)} in {content.space} coordinates",
         "# time_s tx_m ty_m tz_m qx qy qz qw",
     ]
-    for record in content.usable:
+    for record, time_s in content.timed(content.usable):
         T = content.pose(record)
         numbers = [*(T[:3, 3] / MM_PER_M).tolist(), *quaternion(T).tolist()]
-        lines.append(f"{content.time_s(record):.9f} {' '.join(f'{number:.15g}' for number in numbers)}")
+        lines.append(f"{time_s:.9f} {' '.join(f'{number:.15g}' for number in numbers)}")
     return _text(lines)
 
 
@@ -40,10 +40,10 @@ def tf_json(content: Content) -> bytes:
     """``tf2_msgs/TFMessage`` as JSON: each pose maps ``child_frame_id`` to ``header.frame_id`` coordinates (m)."""
     parent, child = f"ctreg_{content.space}", _frame_name(content.model_name)
     transforms = []
-    for record in content.usable:
+    for record, time_s in content.timed(content.usable):
         T = content.pose(record)
         translation, rotation = (T[:3, 3] / MM_PER_M).tolist(), quaternion(T).tolist()
-        seconds, nanoseconds = divmod(round((content.time_s(record) or 0.0) * _NANOSECONDS), _NANOSECONDS)
+        seconds, nanoseconds = divmod(round(time_s * _NANOSECONDS), _NANOSECONDS)
         transforms.append(
             {
                 "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": parent},
