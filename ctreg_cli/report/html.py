@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 
@@ -25,6 +25,7 @@ from ctreg_cli.rods import RodModel
 MAX_SLICES = 2000
 #: residuals drawn for one rod
 MAX_DOTS = 300
+NONE_OK = "<p>No slice is ok.</p>"
 STATUS_WORDS = {
     "ok": "one pose explains the spots and passed every check",
     "ambiguous": "another pose explains the spots too: not to be used",
@@ -196,18 +197,22 @@ def _curves(records: Sequence[SliceRecord]) -> str:
 def _residuals(records: Sequence[SliceRecord]) -> str:
     by_rod = residuals(tuple(records))
     if not by_rod:
+        if not any(record.status == "ok" for record in records):
+            return NONE_OK
         return "<p>The results hold no residuals (a pose table has none; write .json).</p>"
     thinned = [values[:: -(-len(values) // MAX_DOTS)] for values in by_rod.values()]
     return svg.residuals_by_rod(list(by_rod), thinned)
 
 
-def _targets(usable: Iterable[SliceRecord]) -> str:
+def _targets(usable: Sequence[SliceRecord]) -> str:
+    if not usable:
+        return NONE_OK
     found: dict[str, list[TargetRecord]] = {}
     for record in usable:
         for target in record.targets:
             found.setdefault(target.id, []).append(target)
     if not found:
-        return "<p>The frame file names no targets.</p>"
+        return "<p>The results name no targets (the frame file may; a pose table holds none).</p>"
     rows = []
     for name, targets in found.items():
         errors = [target.tre_mm for target in targets]

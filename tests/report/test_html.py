@@ -133,7 +133,10 @@ def test_curve_holds_no_pose_that_is_not_there(tmp_path: Path) -> None:
 def test_empty_and_poseless_runs_are_pages_too(tmp_path: Path) -> None:
     data = json.loads(document_text())
     for results in ([], [row for row in data["results"] if row["status"] == "no_pose"]):
-        assert "No slice has a pose" in report_html(read(tmp_path, json.dumps(data | {"results": results})))
+        page = report_html(read(tmp_path, json.dumps(data | {"results": results})))
+        assert "No slice has a pose" in page
+        assert page.count("No slice is ok") == 2  # not: there are no targets
+        assert "targets (the frame" not in page
 
 
 def test_picture_shows_its_part_of_the_slice() -> None:

@@ -45,8 +45,8 @@
       view.append(element("text", { class: "unseen", x: u, y: v - size, "font-size": size, "text-anchor": "middle", "dominant-baseline": "middle" }, id));
     }
     for (const [rod, u, v, ru, rv] of slice.spots) {
-      const away = Math.hypot(u - middle[0], v - middle[1]) || 1;
-      const x = u + 1.6 * size * (u - middle[0]) / away, y = v + 1.6 * size * (v - middle[1]) / away;
+      const away = Math.hypot(u - middle[0], v - middle[1]), outwards = away > size ? [(u - middle[0]) / away, (v - middle[1]) / away] : [0, -1];
+      const x = u + 1.6 * size * outwards[0], y = v + 1.6 * size * outwards[1];
       view.append(element("circle", { cx: u, cy: v, r: size * 0.45 }));
       view.append(element("line", { class: "arrow", x1: u, y1: v, x2: u + RESIDUAL_ZOOM * ru, y2: v + RESIDUAL_ZOOM * rv }));
       view.append(element("text", { x, y, "font-size": size, "text-anchor": "middle", "dominant-baseline": "middle" }, rod));
@@ -79,7 +79,7 @@
 
   // ---- 3D scene, in slice coordinates ------------------------------------------------------------------------------
   const START = { turn: -35, tilt: 62, zoom: 1 };
-  const FILLED = 0.92;
+  const FILLED = 0.92, FARTHEST = 4;
   const camera = { ...START };
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const moved = (T, p) => [0, 1, 2].map((r) => T[4 * r] * p[0] + T[4 * r + 1] * p[1] + T[4 * r + 2] * p[2] + T[4 * r + 3]);
@@ -110,10 +110,16 @@
 
   function extent() {
     // the same for all slices, so that nothing jumps while sliding; all is in view as the scene is first seen
-    const points = slices.map(sceneOf).flatMap((scene) => [...scene.plane, ...scene.rods.flatMap((rod) => rod.ends), ...scene.targets.map((target) => target.place)]);
-    if (!points.length) return { middle: [0, 0, 0], radius: 1 };
+    const scenes = slices.map(sceneOf);
+    const frame = scenes.flatMap((scene) => [...scene.plane, ...scene.rods.flatMap((rod) => rod.ends)]);
+    if (!frame.length) return { middle: [0, 0, 0], radius: 1 };
     const span = (places, k) => places.reduce(([low, high], p) => [Math.min(low, p[k]), Math.max(high, p[k])], [Infinity, -Infinity]);
-    const middle = [0, 1, 2].map((k) => { const [low, high] = span(points, k); return (low + high) / 2; });
+    const centre = (places) => [0, 1, 2].map((k) => { const [low, high] = span(places, k); return (low + high) / 2; });
+    const from = centre(frame), apart = (p) => Math.hypot(...p.map((value, k) => value - from[k]));
+    // a target far away would leave of the frame only a dot
+    const limit = FARTHEST * frame.reduce((most, p) => Math.max(most, apart(p)), 0);
+    const points = [...frame, ...scenes.flatMap((scene) => scene.targets.map((target) => target.place)).filter((p) => apart(p) <= limit)];
+    const middle = centre(points);
     const seen = points.map((p) => turned(p.map((value, k) => value - middle[k]), START));
     const reach = [0, 1].flatMap((k) => span(seen, k).map(Math.abs));
     return { middle, radius: Math.max(...reach) || 1 };
