@@ -9,7 +9,7 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray
 
 #: a rod whose direction has a smaller |z| than this lies *in* the slice: it leaves a line, no spot
-MIN_DIRECTION_Z = 1e-9
+MIN_DIRECTION_Z = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

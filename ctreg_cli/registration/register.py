@@ -16,6 +16,7 @@ from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.integrity import protection_levels
 from ctreg_cli.registration.linearity import covariance_along_the_valley, positive_part
 from ctreg_cli.registration.matching import Matches, Scene, doubt, observations, search
+from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import (
     Linearisation,
@@ -163,6 +164,19 @@ def _seen_by(model: RodModel, scene: Scene, candidate: Candidate) -> Observation
     return observations(scene, spot_of_rod)
 
 
+def _seen_or_nearly(model: RodModel, scene: Scene, scale: Scale, best: Candidate) -> Observations:
+    """A candidate's matches, and free spots beside the places of rods it misses."""
+    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
+    spot_of_rod[0, best.rod_index] = best.spot_index
+    free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_index)
+    for rod, place_mm in zip(best.missing_rods, best.missing_px * scale.mm_per_px, strict=True):
+        gap = np.linalg.norm(scene.xy_mm[free] - place_mm, axis=1)
+        if len(free) and gap.min() < 2 * _LOOSE_SHARE * model.size_mm:
+            spot_of_rod[0, rod] = free[gap.argmin()]
+            free = np.delete(free, gap.argmin())
+    return observations(scene, spot_of_rod)
+
+
 def _log_others(matches: Matches) -> float:
     """ln of the odds of chance (1) and of all matches that share less than half with the best, together.
 
@@ -235,6 +249,14 @@ def decide(
         warnings.append(
             ("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times")
         )
+    covariance, suspicion = covariance_with_misfit(
+        model, best.T_slice_model, best.covariance, _seen_or_nearly(model, scene, scale, best)
+    )
+    if covariance is None:
+        return refused("bad_fit")
+    if suspicion:
+        best = replace(best, covariance=frozen(covariance, (6, 6)))
+        warnings.append(("misfit", suspicion))
     best, share = averaged(best, doubts)
     if share > _WORTH_SAYING:
         warnings.append(
