@@ -73,13 +73,7 @@ def write_text(path: str | Path, text: str) -> None:
     Raises:
         InputError: the file cannot be written there.
     """
-    file = AtomicFile(path)
-    try:
-        file.stream.write(text)
-    except BaseException:
-        file.abandon()
-        raise
-    file.commit()
+    write_bytes(path, text.encode())
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
@@ -92,6 +86,9 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     try:
         # what is below the text stream takes bytes; nothing has been written as text
         file.stream.buffer.write(data)
+    except OSError as error:  # the disk is full
+        file.abandon()
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
     except BaseException:
         file.abandon()
         raise

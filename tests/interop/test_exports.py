@@ -297,3 +297,16 @@ def test_markups_need_the_frame(tmp_path: Path) -> None:
 def test_unknown_suffix_lists_those_there_are() -> None:
     with pytest.raises(InputError, match=r"\.tfm.*\.parquet"):
         check_export("x.xyz")
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(content: Content, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    _, most = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    place = tmp_path / "t.parquet"
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, most))
+    try:
+        with pytest.raises(InputError, match=r"t\.parquet: cannot be written"):
+            write_export(str(place), content)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in tmp_path.iterdir()] == ["results.json"]
