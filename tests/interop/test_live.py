@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import socket
 import subprocess
 import sys
 import threading
@@ -30,7 +31,10 @@ N = 5
 
 @needs_storescu
 def test_from_sender_to_client(cpp_client: Path, tmp_path: Path) -> None:
-    """What the C++ client receives is what the table holds, to 1e-6 of 32-bit floats and bit for bit in the quality."""
+    """What the C++ client receives is what the table holds, to 1e-6 of 32-bit floats and bit for bit in the quality.
+
+    Peers that mean no good come before and between; every good slice is tracked all the same.
+    """
     pytest.importorskip("pynetdicom")
     port, igtl, table = free_port(), free_port(), tmp_path / "poses.csv"
     options = ["--port", port, "--igtl", igtl, "--queue", "all", "--count", N, "--idle", LIMIT_S, "-o", table]
@@ -43,7 +47,14 @@ def test_from_sender_to_client(cpp_client: Path, tmp_path: Path) -> None:
         assert client.stdout is not None
         assert client.stdout.readline() == "CONNECTED\n"
         time.sleep(0.2)  # it is connected, and now also let in
-        assert storescu(port, *SLICES[:N]).returncode == 0
+        crowd = [socket.create_connection(("127.0.0.1", port)) for _ in range(50)]
+        for number, peer in enumerate(crowd[::5]):
+            peer.sendall([b"\x01\0\xff\xff\xff\xff", np.random.default_rng(number).bytes(10_000)][number % 2])
+        assert storescu(port, SLICES[0]).returncode == 0
+        assert storescu(port, SLICES[1], called="OTHER").returncode != 0
+        assert storescu(port, *SLICES[1:N]).returncode == 0
+        for peer in crowd:
+            peer.close()
         out, _ = client.communicate(timeout=LIMIT_S)
         _, said = listener.communicate(timeout=LIMIT_S)
     finally:
