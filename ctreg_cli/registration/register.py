@@ -230,8 +230,8 @@ def decide(
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
     near = [c for c in candidates[1:] if c.log_odds > best.log_odds - math.log(RIVAL_ODDS)]
-    doubts = [c for c in near if _knows_less(c, best)]
-    rivals = [c for c in near if pose_distance_sd(best, c) > RIVAL_SD and not any(c is d for d in doubts)]
+    doubts = [c for c in near if _knows_less(c, best) or pose_distance_sd(best, c) <= RIVAL_SD]
+    rivals = [c for c in near if not any(c is d for d in doubts)]
     if free and not rivals:
         rivals = [c for c in candidates[1:] if _hangs_on_one_spot(best, c)]
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
@@ -448,8 +448,9 @@ def _knows_less(c: Candidate, best: Candidate) -> bool:
 def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
     """``best`` with a covariance that covers the variants of its own match: Bayesian model averaging about its pose.
 
-    A variant without the one spot that fixes a direction (``doubts``) contradicts nothing, but if it is the truth,
-    the error is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``, the weights w from the odds.
+    A variant without the one spot that fixes a direction, or with a spot given to the next rod (``doubts``), contradicts
+    nothing, but if it is the truth, the error is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``,
+    the weights w from the odds.
 
     Returns the candidate and the weight of all variants together.
     """
