@@ -1,0 +1,75 @@
+"""The search finds the truth, whatever the noise does to three spots; and whatever else lies in the slice."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.matching import LEAST_CHECKED, plan, search
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.register import make_scene, register
+from ctreg_cli.scale import Scale
+from tests.oracle import random_frame
+from tests.registration.frames import model_of, some_scene
+
+HALF_MM = Scale(s_x=0.5, s_y=0.5)
+
+
+@pytest.mark.parametrize("n", [5, 7, 9])
+def test_two_triples_of_any_five_rods_are_tried(n: int) -> None:
+    model = model_of(random_frame(np.random.default_rng([860, n]), n))
+    layout = plan(model)
+    for k in range(LEAST_CHECKED + 1, n + 1):
+        tried = [set(map(int, triple)) for triple in layout.triples[: layout.prefix[k]]]
+        for rods in itertools.combinations(range(n), k):
+            assert sum(triple <= set(rods) for triple in tried) >= 2, (k, rods)
+
+
+@pytest.mark.parametrize("sd_px", [0.1, 0.3])
+def test_the_true_labels_are_among_the_matches(sd_px: float) -> None:
+    rng = np.random.default_rng([861, int(10 * sd_px)])
+    for seed in range(12):
+        frame = random_frame(rng, 8)
+        world = some_scene(rng, frame, sd_px=sd_px, missing=1, false=3, least=6)
+        spots = Spots.from_points(world.uv_px, world.sd_px)
+        model = model_of(frame)
+        scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
+        found = search(model, scene, least_matches=5)
+        true = {(int(rod), spot) for spot, rod in enumerate(world.rod_of_spot) if rod >= 0}
+        assert found is not None, seed
+        matches = [{(rod, int(spot)) for rod, spot in enumerate(row) if spot >= 0} for row in found.spot_of_rod]
+        # noise may leave one of the true spots outside its gate
+        assert any(len(true & match) >= len(true) - 1 for match in matches), seed
+
+
+def test_of_two_frames_in_a_slice_none_is_picked_at_random() -> None:
+    rng = np.random.default_rng(862)
+    for seed in range(4):
+        frame = random_frame(rng, 8)
+        one = some_scene(rng, frame, sd_px=0.1, least=8)
+        other = some_scene(rng, frame, sd_px=0.1, least=8)
+        aside = other.uv_px - other.uv_px.mean(axis=0) + one.uv_px.mean(axis=0) + [120.0, 0.0]
+        both = Spots.from_points(np.concatenate([one.uv_px, aside]), 0.1)
+        result = register(both, model_of(frame), scale=HALF_MM)
+        assert result.status != "ok", seed
+        assert len(result.candidates) > 1 or result.status == "no_pose", seed
+
+
+def test_a_field_of_dots_hides_no_frame() -> None:
+    rng = np.random.default_rng(863)
+    frame = random_frame(rng, 9)
+    world = some_scene(rng, frame, sd_px=0.1, least=9)
+    step = 14.0
+    dots = np.stack(np.meshgrid(np.arange(6) * step, np.arange(6) * step), axis=-1).reshape(-1, 2)
+    dots = dots - dots.mean(axis=0) + world.uv_px.mean(axis=0) + rng.uniform(-5, 5, 2)
+    spots = Spots.from_points(np.concatenate([world.uv_px, dots + rng.normal(size=dots.shape) * 0.1]), 0.1)
+    result = register(spots, model_of(frame), scale=HALF_MM)
+    assert result.status == "ok", result.reason
+    best = result.candidates[0]
+    labels = [int(world.rod_of_spot[spot]) if spot < len(world.uv_px) else -1 for spot in best.spot_index]
+    assert labels == best.rod_index.tolist()
+    off = best.T_slice_model[:3, 3] - world.t
+    assert np.linalg.norm(off) < 6 * np.sqrt(np.trace(best.covariance[:3, :3]))
