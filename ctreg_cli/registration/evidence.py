@@ -29,13 +29,15 @@ from scipy.special import gammaln
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry.pose import rotation_angle
-from ctreg_cli.registration.refine import Linearisation, covariance_from_information
+from ctreg_cli.registration.refine import Linearisation
 from ctreg_cli.rods import RodModel
 
 #: probability that a rod the slice cuts leaves a spot the segmentation finds
 P_SEEN = 0.8
 #: clutter fainter than this share of the faintest matched spot is not mistaken for a rod: rods are of one metal
 _FAINTER = 0.75
+#: how far Laplace's method may carry a rotation that the spots leave open
+_WIDEST_TURN_RAD = 0.3
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their centre
 _NEIGHBOURHOOD = 1.25
 
@@ -139,14 +141,13 @@ def log_odds(
     field = np.maximum(area, float(extent[0] * extent[1]))
 
     H, _ = fit.normal_equations()
-    C, _ = covariance_from_information(H, model.size_mm)
-    # the prior is no wider than the frame is tall along z: a direction the spots say nothing of is worth nothing, not
-    # 10⁶
+    # a direction the spots say nothing of is as wide as the prior, not 10⁶: about a frame's size, and a tilt
+    widest = np.diag([model.size_mm**-2.0] * 3 + [_WIDEST_TURN_RAD**-2.0] * 3)
+    _, log_information = np.linalg.slogdet(H + widest)
     log_prior = prior.log_density(T[:, :3, :3]) - np.log(field * 2 * model.size_mm)
     if log_prior_density is not None:
         log_prior = log_prior_density
-    _, logdet = np.linalg.slogdet(C)
-    volume = np.minimum(log_prior + 3 * math.log(2 * math.pi) + 0.5 * logdet, 0.0)
+    volume = np.minimum(log_prior + 3 * math.log(2 * math.pi) - 0.5 * log_information, 0.0)
 
     det_w = fit.weight[..., 0, 0] * fit.weight[..., 1, 1] - fit.weight[..., 0, 1] * fit.weight[..., 1, 0]
     per_spot = np.where(

@@ -263,8 +263,6 @@ def decide(
             ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
         )
     best = protected(model, scene, best, options)
-    if not rivals and len(best.rod_index) > LEAST_MATCHES and np.isinf(best.protection_mm).any():
-        return refused("unprotected")  # without one of its spots nothing would be known: that spot is the pose
     if options.alert_limit_mm is not None and not rivals and best.protection_mm.max() > options.alert_limit_mm:
         return refused("unprotected")
     warnings.extend(fit_warnings(model, spots, best))
