@@ -52,6 +52,8 @@ _COVER = 2
 _BEYOND_CHANCE = math.log(1e9)
 #: hypotheses a stage hands on to refinement
 _KEEP_PER_STAGE = 40
+#: ... and one that only asks whether a match beyond chance has a rival
+_KEEP_TO_CONFIRM = 10
 #: votes are a rough measure of the odds: hypotheses this many nats under the best of a rod triple are not refined
 _VOTES_WITHIN = 25.0
 #: rivals within this many nats of the best are kept for the verdict (a good deal more than the verdict's own 100 : 1)
@@ -62,6 +64,8 @@ _RIVALS_WITHIN = 7.5
 _DOUBT_WITHIN = 7.0
 #: rod triples of a match whose roots it is refined from anew, to find its second minima
 _RESTARTS = 20
+#: ... and half of them do for so many matches
+_MANY_MATCHES = 8
 #: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
 _VERIFY_STEPS = (12, 6)
 #: spot triples examined at once: as many as stay in the processor's cache
@@ -261,7 +265,8 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
         while done < layout.prefix[k]:
             # few hypotheses cost less together, many are worth stopping after each triple
             end = done + 1 if len(start_from) > _MANY_SPOTS else layout.prefix[k]
-            part = _search_triples(model, scene, layout.triples[done:end], start_from, least_matches, seen)
+            most = _KEEP_PER_STAGE if len(start_from) == m else _KEEP_TO_CONFIRM
+            part = _search_triples(model, scene, layout.triples[done:end], start_from, least_matches, seen, most=most)
             done = end
             if part is None:
                 continue
@@ -288,7 +293,8 @@ def _second_frame(model: RodModel, scene: Scene, best: Matches, least_matches: i
     if not enough:
         return None
     layout = plan(model)
-    return _search_triples(model, scene, layout.triples[: layout.prefix[enough[0]]], free, enough[0], set())
+    triples = layout.triples[: layout.prefix[enough[0]]]
+    return _search_triples(model, scene, triples, free, enough[0], set(), most=_KEEP_TO_CONFIRM)
 
 
 def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
@@ -310,11 +316,18 @@ def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
 
 
 def _search_triples(
-    model: RodModel, scene: Scene, rods: IntArray, start_from: IntArray, least_matches: int, seen: set[bytes]
+    model: RodModel,
+    scene: Scene,
+    rods: IntArray,
+    start_from: IntArray,
+    least_matches: int,
+    seen: set[bytes],
+    *,
+    most: int = _KEEP_PER_STAGE,
 ) -> Matches | None:
     """Poses from rod triples (g, 3) against all triples of the spots ``start_from``, voted by all spots and weighed.
 
-    ``seen`` collects the match sets already weighed.
+    ``seen`` collects the match sets already weighed; the ``most`` promising ones are.
     """
     layout = plan(model)
     noise = _noise_mm(model, scene)
@@ -337,7 +350,7 @@ def _search_triples(
     score, T, spot_of_rod = (np.concatenate(column) for column in zip(*kept, strict=True))
     top: list[int] = []
     for i in np.argsort(-score, kind="stable"):
-        if len(top) >= _KEEP_PER_STAGE or score[i] < score[top[0] if top else i] - _VOTES_WITHIN:
+        if len(top) >= most or score[i] < score[top[0] if top else i] - _VOTES_WITHIN:
             break
         key = spot_of_rod[i].tobytes()
         if key not in seen:
@@ -645,8 +658,9 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     spot_of_rod = matches.spot_of_rod[row]
     matched = np.nonzero(spot_of_rod >= 0)[0]
     triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
-    if len(triples) > _RESTARTS:  # many matches: twins are rare, and each of them shows in most triples
-        triples = triples[:: len(triples) // _RESTARTS + 1]
+    most = _RESTARTS if len(matched) < _MANY_MATCHES else _RESTARTS // 2
+    if len(triples) > most:  # many matches: twins are rare, and each of them shows in most triples
+        triples = triples[:: len(triples) // most + 1]
     noise = _noise_mm(model, scene)
     T, _ = solve_three(
         RodTriples.of(model, triples),
@@ -659,9 +673,9 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
         return None
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
     # most of the starts are far off and say so at once, most of the others after a few steps
-    for most, iterations in ((60, 3), (16, 6)):
+    for kept, iterations in ((40, 2), (12, 6)):
         T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
-        T = T[np.argsort(fit.chi2, kind="stable")[:most]]
+        T = T[np.argsort(fit.chi2, kind="stable")[:kept]]
         T = T[_distinct_poses(model, T)]
     return weigh(model, scene, T[:8], np.array(same[: min(len(T), 8)]), least_matches)
 
@@ -725,4 +739,6 @@ def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_match
             starts.append(T_without[which])
     variants_all = np.concatenate(variants) if variants else np.empty((0, len(model)), dtype=np.intp)
     starts_all = np.concatenate(starts) if starts else np.empty((0, 4, 4))
-    return weigh(model, scene, starts_all, variants_all, least_matches)
+    _, first = np.unique(np.concatenate([spot_of_rod[None], variants_all]), axis=0, return_index=True)
+    new = np.sort(first[first > 0]) - 1
+    return weigh(model, scene, starts_all[new], variants_all[new], least_matches)
