@@ -350,8 +350,6 @@ def test_velocity_is_that_of_the_truth_within_its_sd() -> None:
     for i in range(10, 39):
         velocity = results[i].velocity
         assert velocity is not None
-        if any(name == "misfit" for name, _ in results[i].warnings):
-            continue  # widened on purpose: one slice in a hundred by design
         before, after = made.truth[i - 1], made.truth[i + 1]
         true = error_of(_pose(after), before) / (times[i + 1] - times[i - 1])
         d = velocity.twist - true
