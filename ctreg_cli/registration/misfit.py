@@ -4,7 +4,7 @@
 little and together: pixels that are not as large as they say, a frame drawn too tall. The score test (Rao 1948) asks
 along just those directions. With ``K`` the derivative of the predicted spots with respect to these unknowns, ``J`` to
 the pose, both weighted, what is left of K beside J is ``K' = K − J (JᵀJ)⁻¹ JᵀK``, and the unknowns' estimate is ``θ =
-(K'ᵀK')⁻¹ K'ᵀ r`` with the information ``K'ᵀK'``.
+(K'ᵀK' + P)⁻¹ K'ᵀ r``, P the prior that drawings and scales are off by percents.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ CERTAIN_P = 1e-9
 _EXPLAINED_P = 1e-3
 #: relative step of the numeric derivative with respect to the frame's height
 _STEP = 1e-4
-#: how far off (relative sd) a scale may be
-_SCALE_SD = 0.05
-#: singular values under this share of the largest are rounding
-_TOLD = 1e-6
+#: how far off (relative sd) a scale or a height may be
+_RELATIVE_SD = 0.05
 
 
 def covariance_with_misfit(
@@ -57,25 +55,23 @@ def covariance_with_misfit(
     K = (root @ _derivatives(model, T, seen.mm_per_px)[used]).reshape(len(r), -1)
     J_plus = np.linalg.pinv(J)
     r_beside, beside = r - J @ (J_plus @ r), K - J @ (J_plus @ K)
-    # what the pose can imitate altogether, no residual can tell
-    _, size, directions = np.linalg.svd(beside, full_matrices=False)
-    told = size > _TOLD * np.linalg.norm(K, axis=0).max()
-    left_over = len(r) - 6 - int(told.sum())
-    if not told.any() or left_over < 1:
-        return covariance, ""
-    theta = np.linalg.pinv(beside, rcond=_TOLD) @ r_beside
-    score = float(np.sum((beside @ theta) ** 2))
-    explained = chdtrc(left_over, max(float(r_beside @ r_beside) - score, 0.0)) > _EXPLAINED_P
-    if not explained or chdtrc(int(told.sum()), score) > SUSPECT_P:
+    # the prior as three more observations: what the pose can imitate is then off by a few percent, not by half
+    information = beside.T @ beside + np.eye(K.shape[1]) / _RELATIVE_SD**2
+    pull = beside.T @ r_beside
+    theta = np.linalg.solve(information, pull)
+    score = float(pull @ theta)
+    left_over = len(r) - 6 - len(theta)
+    explained = left_over > 0 and chdtrc(left_over, max(float(r_beside @ r_beside) - score, 0.0)) > _EXPLAINED_P
+    chance = chdtrc(len(theta), score)
+    if not explained or chance > SUSPECT_P:
         return covariance, ""
     worst = int(np.abs(theta).argmax())
     what = ("the scale along x", "the scale along y", "the frame's height")[worst]
     text = f"{what} seems {100 * abs(theta[worst]):.2g} % off; sd widened to cover it"
-    if chdtrc(int(told.sum()), score) < CERTAIN_P:
+    if chance < CERTAIN_P:
         return None, text
     moved, shift = J_plus @ (r - K @ theta), J_plus @ K
-    spread = (directions[told].T / size[told] ** 2) @ directions[told]
-    by_height = np.outer(moved, moved) + shift @ spread @ shift.T
+    by_height = np.outer(moved, moved) + shift @ np.linalg.solve(information, shift.T)
     return covariance + by_height + _spread_by_scale(model, T, covariance, seen), text
 
 
@@ -88,7 +84,7 @@ def _spread_by_scale(model: RodModel, T: FloatArray, covariance: FloatArray, see
     if not np.isfinite(start.chi2).all():
         return np.zeros((6, 6))
     fit = refine_scales(
-        model, T[None], seen, prior_mm_per_px=seen.mm_per_px, prior_sd=_SCALE_SD * seen.mm_per_px, iterations=15
+        model, T[None], seen, prior_mm_per_px=seen.mm_per_px, prior_sd=_RELATIVE_SD * seen.mm_per_px, iterations=15
     )
     # seen from the pixels, not from the corner of the image: the frame's centre stays at its spots
     T_free = np.array(fit.T[0])
