@@ -23,6 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.special import chdtrc
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
@@ -62,6 +63,8 @@ _KEEP_WITHIN = 12.0
 _RIVALS_WITHIN = 7.5
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
+#: voted hypotheses looked at for a vote that spoils them, and the χ² probability under which one does
+_REPAIRED, _SPOILT_P = 12, 1e-4
 #: rod triples of a match whose roots it is refined from anew, to find its second minima
 _RESTARTS = 20
 #: ... and half of them do for so many matches
@@ -358,7 +361,33 @@ def _search_triples(
             top.append(int(i))
     if not top:
         return None
-    return verify(model, scene, T[top], spot_of_rod[top], least_matches)
+    verified = verify(model, scene, T[top], spot_of_rod[top], least_matches)
+    if verified is not None and verified.log_odds[0] > _BEYOND_CHANCE:
+        return verified
+    repaired = _repair(model, scene, T[top[:_REPAIRED]], spot_of_rod[top[:_REPAIRED]], least_matches)
+    parts = [part for part in (verified, repaired) if part is not None]
+    return join(parts) if parts else None
+
+
+def _repair(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, least_matches: int) -> Matches | None:
+    """Voted hypotheses that do not fit, each without the one vote that spoils it.
+
+    Among clutter a false spot votes now and then, and one is enough to pull the pose away from all the true ones.
+    """
+    _, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=_VERIFY_STEPS[0], step_tolerance=1e-3)
+    n = (spot_of_rod >= 0).sum(axis=1)
+    spoilt = np.nonzero((chdtrc(np.maximum(2 * n - 6, 1), fit.chi2) < _SPOILT_P) & (n > least_matches))[0]
+    if len(spoilt) == 0:
+        return None
+    row, rod = np.nonzero(spot_of_rod[spoilt] >= 0)
+    without = spot_of_rod[spoilt][row]
+    without[np.arange(len(row)), rod] = -1
+    T_without, fit, _ = refine(
+        model, T[spoilt][row], observations(scene, without), iterations=_VERIFY_STEPS[0], step_tolerance=1e-3
+    )
+    order = np.lexsort((fit.chi2, row))
+    best = order[np.unique(row[order], return_index=True)[1]]
+    return verify(model, scene, T_without[best], without[best], least_matches)
 
 
 def _noise_mm(model: RodModel, scene: Scene) -> float:

@@ -446,9 +446,9 @@ def _knows_less(c: Candidate, best: Candidate) -> bool:
 def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
     """``best`` with a covariance that covers the variants of its own match: Bayesian model averaging about its pose.
 
-    A variant without the one spot that fixes a direction, or with a spot given to the next rod (``doubts``), contradicts
-    nothing, but if it is the truth, the error is larger than the full match believes: ``C = Σ w_k (C_k + δ_k δ_kᵀ)``,
-    the weights w from the odds.
+    A variant without the one spot that fixes a direction, or with a spot given to the next rod (``doubts``),
+    contradicts nothing, but if it is the truth, the error is larger than the full match believes:
+    ``C = Σ w_k (C_k + δ_k δ_kᵀ)``, the weights w from the odds.
 
     Returns the candidate and the weight of all variants together.
     """
