@@ -40,6 +40,8 @@ ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 RIVAL_ODDS = 100.0
 #: ln odds within which a rival counts that is the best match without one of its spots, where spots are false
 _FRAGILE_LOG_ODDS = 5.3
+#: ... and that explains all of the same spots: twins are no chance, they come with the geometry
+_TWIN_LOG_ODDS = 7.0
 #: ... when its pose is farther off than this many standard deviations (contract §5)
 RIVAL_SD = 6.0
 #: a fit with a smaller χ² probability is refused
@@ -205,7 +207,7 @@ def decide(
     """The verdict on a slice's matches, best first."""
     options = options or RegistrationOptions()
     candidates = refined_candidates(
-        model, scene, spots, scale, matches.subset(matches.log_odds > matches.log_odds[0] - _FRAGILE_LOG_ODDS)
+        model, scene, spots, scale, matches.subset(matches.log_odds > matches.log_odds[0] - _TWIN_LOG_ODDS)
     )
     best = candidates[0]
     free = len(spots) > len(best.rod_index)
@@ -233,7 +235,10 @@ def decide(
     doubts = [c for c in near if _knows_less(c, best) or pose_distance_sd(best, c) <= RIVAL_SD]
     rivals = [c for c in near if not any(c is d for d in doubts)]
     if free and not rivals:
-        rivals = [c for c in candidates[1:] if _hangs_on_one_spot(best, c)]
+        fragile = best.log_odds - _FRAGILE_LOG_ODDS
+        rivals = [c for c in candidates[1:] if c.log_odds > fragile and _hangs_on_one_spot(best, c)]
+    if not rivals:
+        rivals = [c for c in candidates[1:] if _is_twin(best, c)]
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
@@ -428,6 +433,12 @@ def _hangs_on_one_spot(best: Candidate, c: Candidate) -> bool:
     """
     one_less = len(c.rod_index) == len(best.rod_index) - 1 and _matches(c) < _matches(best)
     return one_less and not _knows_less(c, best) and pose_distance_sd(best, c) > RIVAL_SD
+
+
+def _is_twin(best: Candidate, c: Candidate) -> bool:
+    """Whether ``c`` explains all of the same spots at a pose that contradicts ``best``."""
+    same_spots = set(best.spot_index.tolist()) <= set(c.spot_index.tolist())
+    return same_spots and pose_distance_sd(best, c) > RIVAL_SD
 
 
 def _matches(c: Candidate) -> set[tuple[int, int]]:
