@@ -63,8 +63,9 @@ _KEEP_WITHIN = 12.0
 _RIVALS_WITHIN = 7.5
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
-#: voted hypotheses looked at for a vote that spoils them, and the χ² probability under which one does
-_REPAIRED, _SPOILT_P = 12, 1e-4
+#: voted hypotheses looked at for a vote that spoils them, the score they need (ln odds, roughly), and the χ²
+#: probability under which one does
+_REPAIRED, _WORTH_REPAIR, _SPOILT_P = 12, 4.0, 1e-4
 #: rod triples of a match whose roots it is refined from anew, to find its second minima
 _RESTARTS = 20
 #: ... and half of them do for so many matches
@@ -364,7 +365,8 @@ def _search_triples(
     verified = verify(model, scene, T[top], spot_of_rod[top], least_matches)
     if verified is not None and verified.log_odds[0] > _BEYOND_CHANCE:
         return verified
-    repaired = _repair(model, scene, T[top[:_REPAIRED]], spot_of_rod[top[:_REPAIRED]], least_matches)
+    hopeful = [i for i in top[:_REPAIRED] if score[i] > _WORTH_REPAIR]
+    repaired = _repair(model, scene, T[hopeful], spot_of_rod[hopeful], least_matches) if hopeful else None
     parts = [part for part in (verified, repaired) if part is not None]
     return join(parts) if parts else None
 
