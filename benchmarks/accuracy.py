@@ -89,10 +89,14 @@ def errors(T: np.ndarray, frame: OracleFrame, world: OracleScene) -> tuple[float
     return float(np.linalg.norm(twist[3:])), float(place), twist
 
 
+def at_arm(arm: np.ndarray) -> np.ndarray:
+    """(3, 6) that takes a twist error to the error of a point at ``arm`` (3,) from the model origin: ``V + Ω × arm``."""
+    return np.hstack([np.eye(3), np.cross(arm, np.eye(3))])
+
+
 def bound_sds(frame: OracleFrame, world: OracleScene) -> tuple[float, float]:
     """Square roots of the bound on the mean square rotation and position error (rad, mm)."""
-    centre = world.R @ (frame.starts + frame.ends).mean(axis=0) / 2
-    G = np.hstack([np.eye(3), -np.cross(np.eye(3), centre)])
+    G = at_arm(world.R @ (frame.starts + frame.ends).mean(axis=0) / 2)
     return math.sqrt(np.trace(world.bound[3:, 3:])), math.sqrt(np.trace(G @ world.bound @ G.T))
 
 
@@ -169,8 +173,7 @@ def _settled(
     T[:3, :3], T[:3, 3] = R, t
     if is_wrong(T, frame, world):
         return False
-    centre = world.R @ (frame.starts + frame.ends).mean(axis=0) / 2
-    G = np.hstack([np.eye(3), -np.cross(np.eye(3), centre)])
+    G = at_arm(world.R @ (frame.starts + frame.ends).mean(axis=0) / 2)
     unit = np.array([1, 1, 1, 0.03, 0.03, 0.03])
     axes = np.linalg.eigh(world.bound / np.outer(unit, unit))[1] * unit[:, None]
     sd_turn, sd_place = bound_sds(frame, world)

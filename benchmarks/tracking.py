@@ -30,7 +30,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import DECIDABLE, WRONG_SD, fitted, oracle_log_odds
+from benchmarks.accuracy import DECIDABLE, WRONG_SD, at_arm, fitted, oracle_log_odds
 from ctreg_cli import pipeline
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import TrackingOptions
@@ -178,8 +178,7 @@ def variants(
 def is_known(made: Sequence, world: OracleScene, R: np.ndarray, t: np.ndarray, rods: list[int]) -> bool:
     """Whether these rods alone bound the pose."""
     C = bound(made.frame, rods, R, t, world.mm_per_px, world.sd_px)
-    middle = R @ (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2
-    G = np.hstack([np.eye(3), np.cross(middle, np.eye(3))])
+    G = at_arm(R @ (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2)
     place, turn = (math.sqrt(np.linalg.eigvalsh(c)[-1]) for c in (G @ C @ G.T, C[3:, 3:]))
     return place <= KNOWN_MM and turn <= KNOWN_RAD
 

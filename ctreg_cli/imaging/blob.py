@@ -143,18 +143,7 @@ def _measure_lone(image: UprightImage, middles: IntArray, radius: int) -> tuple[
     background = edge[:, round(BACKGROUND_QUANTILE * (edge.shape[1] - 1))]
     height = flat[:, _core(radius)].max(axis=1) - background
     own = values > (background + 0.5 * height)[:, None, None]
-    centre, moments = _moments(own, radius)
-    return Blobs(
-        middles=middles,
-        radius=radius,
-        values=values,
-        background=background,
-        height=height,
-        own=own,
-        foreign=np.zeros_like(own),
-        centre=centre,
-        moments=moments,
-    ), edge
+    return _with_moments(middles, radius, values, background, height, own, np.zeros_like(own)), edge
 
 
 def _is_lone(blobs: Blobs, edge: FloatArray) -> BoolArray:
@@ -188,6 +177,18 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         if len(clear):
             high = above[clear] > level * height[clear, None, None]
             own[clear] = _apart_from_neighbour(own[clear], own[clear] & high, peak[clear])
+    return _with_moments(middles, radius, values, background, height, own, bright & ~own)
+
+
+def _with_moments(
+    middles: IntArray,
+    radius: int,
+    values: FloatArray,
+    background: FloatArray,
+    height: FloatArray,
+    own: BoolArray,
+    foreign: BoolArray,
+) -> Blobs:
     centre, moments = _moments(own, radius)
     return Blobs(
         middles=middles,
@@ -196,7 +197,7 @@ def _measure(image: UprightImage, middles: IntArray, radius: int) -> Blobs:
         background=background,
         height=height,
         own=own,
-        foreign=bright & ~own,
+        foreign=foreign,
         centre=centre,
         moments=moments,
     )

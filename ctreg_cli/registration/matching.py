@@ -29,7 +29,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field
 from ctreg_cli.geometry.plucker import segment_distance_range
-from ctreg_cli.geometry.projection import project
+from ctreg_cli.geometry.projection import Projection, project
 from ctreg_cli.registration.evidence import P_SEEN, PosePrior, log_odds
 from ctreg_cli.registration.minimal import RodTriples, scan_three, solve_three
 from ctreg_cli.registration.refine import (
@@ -451,7 +451,9 @@ def _vote(
     b, row = len(T), np.arange(len(T))[:, None]
     if b == 0:
         return np.empty(0), np.empty((0, 4, 4)), np.empty((0, n), dtype=np.intp)
-    projection = project(T, model.starts, model.directions)
+    projection = Projection(
+        xy_mm=projection.xy_mm[could], lambda_mm=projection.lambda_mm[could], slope=projection.slope[could]
+    )
     J = np.nan_to_num(motion_field(T, projection))
     k = np.nan_to_num(projection.slope)
     tolerance = (model.tolerances**2)[:, None, None] * (np.eye(2) + k[..., :, None] * k[..., None, :])

@@ -129,7 +129,8 @@ def register(
 
     Returns:
         The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²),
-        leaves no more rods unexplained than it explains, and no other pose comes within odds of 100 : 1.
+        leaves no more rods unexplained than it explains, no other pose comes within odds of 100 : 1 (1000 : 1 where it
+        explains all of the same spots), and a covariance describes what the spots leave open.
     """
     options = options or RegistrationOptions()
     scene = make_scene(
@@ -137,13 +138,17 @@ def register(
     )
     if len(spots) < LEAST_MATCHES:
         return Registration(status="no_pose", reason="too_few_spots", n_spots=len(spots))
-    # a match of four among many spots could never be believed: do not look for it
-    least = LEAST_MATCHES if min(len(spots), len(model)) <= _FEW else LEAST_MATCHES + 1
+    least = least_matches(len(spots), len(model))
     matches = search(model, scene, least_matches=least)
     if matches is None:
         return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
     matches = doubt(model, scene, matches, least_matches=least)
     return decide(model, scene, spots, scale, matches, options)
+
+
+def least_matches(n_spots: int, n_rods: int) -> int:
+    """How many matches to look for: one of four among many spots could never be believed."""
+    return LEAST_MATCHES if min(n_spots, n_rods) <= _FEW else LEAST_MATCHES + 1
 
 
 def protected(model: RodModel, scene: Scene, best: Candidate, options: RegistrationOptions) -> Candidate:
@@ -159,17 +164,21 @@ def protected(model: RodModel, scene: Scene, best: Candidate, options: Registrat
     return replace(best, protection_mm=frozen(level, (None,)))
 
 
-def _seen_by(model: RodModel, scene: Scene, candidate: Candidate) -> Observations:
-    """The one hypothesis of a candidate's matches."""
+def _spots_of_rods(model: RodModel, candidate: Candidate) -> IntArray:
+    """(1, n) the spot of each rod in a candidate's matches, −1 for none."""
     spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
     spot_of_rod[0, candidate.rod_index] = candidate.spot_index
-    return observations(scene, spot_of_rod)
+    return spot_of_rod
+
+
+def _seen_by(model: RodModel, scene: Scene, candidate: Candidate) -> Observations:
+    """The one hypothesis of a candidate's matches."""
+    return observations(scene, _spots_of_rods(model, candidate))
 
 
 def _seen_or_nearly(model: RodModel, scene: Scene, scale: Scale, best: Candidate) -> Observations:
     """A candidate's matches, and free spots beside the places of rods it misses."""
-    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
-    spot_of_rod[0, best.rod_index] = best.spot_index
+    spot_of_rod = _spots_of_rods(model, best)
     free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_index)
     for rod, place_mm in zip(best.missing_rods, best.missing_px * scale.mm_per_px, strict=True):
         gap = np.linalg.norm(scene.xy_mm[free] - place_mm, axis=1)

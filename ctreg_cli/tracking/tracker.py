@@ -25,7 +25,7 @@ from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.matching import Matches, Scene, doubt, join, search, weigh
 from ctreg_cli.registration.options import TrackingOptions
-from ctreg_cli.registration.register import LEAST_MATCHES, decide, make_scene
+from ctreg_cli.registration.register import LEAST_MATCHES, decide, least_matches, make_scene
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -47,8 +47,6 @@ _ASSIGNMENTS = 3
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
 #: motions that take the rods onto each other as nearly as this (in frame sizes) make a twin worth looking at
 _SYMMETRIC_WITHIN = 0.05
-#: spots or rods up to which a match of four is looked for
-_FEW = 6
 #: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
 _SAME_POSE_D2 = 1e-3
 #: so many spots where the past expects them speak for it even when they do not make a pose
@@ -380,8 +378,7 @@ class Tracker:
     ) -> Tracked:
         """Register a slice from all its spots, without labels; the past is a prior on the pose."""
         model = self.model
-        # a match of four among many spots could never be believed: do not look for it
-        least = LEAST_MATCHES if min(len(spots), len(model)) <= _FEW else CHECKABLE_MATCHES
+        least = least_matches(len(spots), len(model))
         pool = [] if len(spots) < least else [search(model, scene, least_matches=least)]
         if followed is not None:
             pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], least))
