@@ -14,9 +14,10 @@ The pose is integrated out over its prior by Laplace's method, which charges a m
            + n ln A + ln Γ(m − n + ½) − ln Γ(m + ½) + q ln(1 − p)
 
 with C the pose covariance, no wider than the prior where the spots leave a direction open, and π(θ) the prior density
-(uniform in position over the searched field; rotation: see :class:`PosePrior`). ``Γ(m + ½)/Γ(m − n + ½)`` is the number of ways to pick the n spots. Under *chance*
-the sum of E over all matches and poses has the mean 1, so by Markov's inequality a slice of pure clutter reaches ln E
-> x with a probability of at most exp(−x); ``benchmarks/accuracy.py`` measures it.
+(uniform in position over the searched field; rotation: see :class:`PosePrior`). ``Γ(m + ½)/Γ(m − n + ½)`` is the number
+of ways to pick the n spots. Under *chance* the sum of E over all matches and poses has the mean 1, so by Markov's
+inequality a slice of pure clutter reaches ln E > x with a probability of at most exp(−x); ``benchmarks/accuracy.py``
+measures it.
 """
 
 from __future__ import annotations
