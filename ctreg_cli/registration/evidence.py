@@ -35,6 +35,8 @@ from ctreg_cli.rods import RodModel
 
 #: probability that a rod the slice cuts leaves a spot the segmentation finds
 P_SEEN = 0.8
+#: the same for a rod that crosses the slice beside another that left one
+P_RESOLVED = 0.5
 #: clutter fainter than this share of the faintest matched spot is not mistaken for a rod: rods are of one metal
 _FAINTER = 0.75
 #: how far Laplace's method may carry a rotation that the spots leave open
@@ -105,6 +107,7 @@ def log_odds(
     *,
     brightness: FloatArray | None = None,
     spot_of_rod: IntArray | None = None,
+    merged: BoolArray | None = None,
     log_prior_density: FloatArray | None = None,
 ) -> FloatArray:
     """ln E (b,) of ``b`` refined hypotheses, in slice millimetres.
@@ -121,6 +124,7 @@ def log_odds(
         spot_of_rod: (b, n) the spot of each rod: clutter much fainter than any matched spot could not have been taken
         for it,
             and does not count.
+        merged: (b, n) rods without a spot that cross so near a matched one that the two may have left one spot.
         log_prior_density: (b,) ln π(θ) where a prediction says more than ``prior`` (tracking), per mm³ rad³.
     """
     crossing = fit.predicted_px
@@ -154,7 +158,9 @@ def log_odds(
     per_spot = np.where(
         matched, math.log(P_SEEN) - math.log(2 * math.pi) + 0.5 * np.log(np.where(det_w > 0, det_w, 1)), 0
     )
-    missed = (expected & ~matched).sum(axis=1)
+    missed = (expected & ~matched).sum(axis=1) * math.log(1 - P_SEEN)
+    if merged is not None:
+        missed = missed + merged.sum(axis=1) * math.log(1 - P_RESOLVED)
     result: FloatArray = (
         volume
         + per_spot.sum(axis=1)
@@ -162,6 +168,6 @@ def log_odds(
         + n * np.log(area)
         + gammaln(m - n + 0.5)
         - gammaln(m + 0.5)
-        + missed * math.log(1 - P_SEEN)
+        + missed
     )
     return np.where(np.isfinite(result), result, -np.inf)

@@ -8,7 +8,6 @@ slices that are sure of another pose are named and left out. Then one pose is fi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,7 +22,7 @@ from ctreg_cli.registration.adjustment import Adjustment, ScanSpots, adjust
 from ctreg_cli.registration.matching import nearest_assignment
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import Observations, linearise
-from ctreg_cli.registration.register import RIVAL_ODDS, RIVAL_SD, make_scene, register, weakness
+from ctreg_cli.registration.register import RIVAL_LOG_ODDS, RIVAL_SD, make_scene, register, weakness
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -197,14 +196,14 @@ def _view(place: int, item: SpotSlice, model: RodModel, scale: Scale | None, opt
 
 
 def _hypotheses(views: list[_View]) -> list[_Hypothesis]:
-    """The common pose most slices agree on, and those that come within odds of 100 : 1 of it."""
+    """The common pose most slices agree on, and those that come near its odds."""
     seeds = [(i, c) for i, view in enumerate(views) for c in view.candidates]
     seeds.sort(key=lambda seed: float(np.trace(seed[1].covariance[3:, 3:])))
     tried = [_agreeing(views, i, c) for i, c in seeds[:_MOST_SEEDS]]
     tried.sort(key=lambda h: -h.log_odds)
     kept: list[_Hypothesis] = []
     for hypothesis in tried:
-        if hypothesis.log_odds < tried[0].log_odds - math.log(RIVAL_ODDS):
+        if hypothesis.log_odds < tried[0].log_odds - RIVAL_LOG_ODDS:
             break
         if all(set(map(id, hypothesis.members.values())).isdisjoint(map(id, k.members.values())) for k in kept):
             kept.append(hypothesis)

@@ -8,7 +8,7 @@ ellipsoid can still hold it, the covariance is made to; where not, nothing small
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,12 @@ _STRAIGHT_RISE = 5.4
 _STRAIGHT_BEND2 = 9.0
 #: a flatter valley widens the covariance, but no more than so many times
 _MOST_WIDENED = 2.5
-#: a truth that costs no more χ² than this must not find the pose wrong by so many of *its* sd
-_PLAUSIBLE_RISE, _WRONG_SD = 7.0, 6.0
+#: where the truth would find the pose wrong by so many of *its* sd, it may lie with this probability at most
+_WRONG_SD, _WRONG_P = 6.0, 0.02
 #: points of the profile on each side
 _POINTS = 8
+#: rise where a rod no longer crosses the slice, and ln of the room beyond which Laplace's method is not believed
+_NO_WAY, _MOST_ROOM = 9.0, 30.0
 
 
 def covariance_along_the_valley(
@@ -46,7 +48,7 @@ def covariance_along_the_valley(
 
     Returns:
         ``covariance`` itself where it is true; a wider one, with the factor; or None where no ellipsoid describes what
-        is known: the profile stays flat for too long, or the truth may lie where the spots say so much more that
+        is known: the profile stays flat for too long, or the truth may well lie where the spots say so much more that
         this pose would be wrong by six of the standard deviations there.
     """
     unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
@@ -55,19 +57,21 @@ def covariance_along_the_valley(
     sd = math.sqrt(max(float(values[-1]), 0.0))
 
     inward = np.linspace(3, 0, _POINTS, endpoint=False)
-    rise, offset, surprise = _profile(model, T, seen, axes, sd * np.concatenate([inward, -inward]))
-    if _may_be_wrong(rise, surprise):
+    profile = _profile(model, T, seen, axes, sd * np.concatenate([inward, -inward]))
+    if profile.wrong_share() > _WRONG_P:
         return None, math.inf
+    rise, offset = profile.rise, profile.offset
     ends = np.array([0, len(inward)])
     bend2 = ((offset[ends] @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
     if float(rise[ends].min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
         return covariance, 1.0
 
     factors = np.linspace(1, _MOST_WIDENED, _POINTS)
-    rise, offset, surprise = _profile(model, T, seen, axes, 3 * sd * np.concatenate([factors, -factors]))
-    risen = np.maximum.accumulate(rise.reshape(2, -1), axis=1) >= 9
-    if not risen.any(axis=1).all() or _may_be_wrong(rise, surprise):
+    outward = _profile(model, T, seen, axes, 3 * sd * np.concatenate([factors, -factors]))
+    risen = np.maximum.accumulate(outward.rise.reshape(2, -1), axis=1) >= 9
+    if not risen.any(axis=1).all() or profile.joined(outward).wrong_share() > _WRONG_P:
         return None, math.inf
+    offset = outward.offset
     ends = risen.argmax(axis=1)
     # the valley may bend: the ellipsoid has to reach its ends where they are, not where its axis points
     reach, straight = offset.reshape(2, -1, 6)[[0, 1], ends] / 3, axes[:, -1] * sd
@@ -82,18 +86,42 @@ def positive_part(M: FloatArray) -> FloatArray:
     return result
 
 
-def _may_be_wrong(rise: FloatArray, surprise: FloatArray) -> bool:
-    return float(np.where(rise <= _PLAUSIBLE_RISE, surprise, 0).max()) > _WRONG_SD
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Profile:
+    """The cost along one direction, ``b`` points, while the other five give way."""
+
+    #: (b,) how far along, mm, and by how much χ² rises there
+    step: FloatArray
+    rise: FloatArray
+    #: (b, 6) twists from the pose to there
+    offset: FloatArray
+    #: (b,) how many sd *of there* the pose is off, in rotation or place: what its error would be called were the truth
+    #: there
+    surprise: FloatArray
+    #: (b,) ln of how much room the other five directions leave there, over that at the pose
+    log_room: FloatArray
+
+    def joined(self, other: _Profile) -> _Profile:
+        """Both."""
+        return _Profile(
+            **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__dataclass_fields__}
+        )
+
+    def wrong_share(self) -> float:
+        """The posterior probability that the truth lies where it would find the pose wrong (Laplace's method)."""
+        order = np.argsort(self.step)
+        step = self.step[order]
+        density = np.exp(-0.5 * np.maximum(self.rise, 0) + np.clip(self.log_room, -_MOST_ROOM, _MOST_ROOM))[order]
+        wrong = density * (self.surprise[order] > _WRONG_SD)
+        # the pose itself is a point of the profile too, of density 1
+        at = int(np.searchsorted(step, 0.0))
+        step, density, wrong = (np.insert(x, at, y) for x, y in ((step, 0.0), (density, 1.0), (wrong, 0.0)))
+        half = np.diff(step) / 2
+        return float(half @ (wrong[1:] + wrong[:-1])) / float(half @ (density[1:] + density[:-1]))
 
 
-def _profile(
-    model: RodModel, T: FloatArray, seen: Observations, axes: FloatArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How much χ² rises (b,) at ``steps`` (b,) along the last of ``axes`` (6, 6) while the others give way.
-
-    Returns the rises; the twists (b, 6) from the pose to where they are reached; and how many standard deviations *of
-    there* the pose is off, in rotation or place (b,): what its error would be called if the truth were there.
-    """
+def _profile(model: RodModel, T: FloatArray, seen: Observations, axes: FloatArray, steps: FloatArray) -> _Profile:
+    """Follow the last of ``axes`` (6, 6) by ``steps`` (b,) while the others give way."""
     b = len(steps)
     repeated = replace(
         seen,
@@ -101,7 +129,7 @@ def _profile(
         covariance_px=np.repeat(seen.covariance_px, b, axis=0),
         matched=np.repeat(seen.matched, b, axis=0),
     )
-    least = linearise(model, T[None], seen).chi2[0]
+    here = linearise(model, T[None], seen)
     moved = poses.update(np.repeat(T[None], b, axis=0), steps[:, None] * axes[:, -1])
     basis = axes[:, :-1]
     for _ in range(5):
@@ -110,10 +138,18 @@ def _profile(
         Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
         moved = poses.update(moved, np.linalg.solve(Hc, (g @ basis)[..., None])[..., 0] @ basis.T)
     there = linearise(model, moved, repeated)
-    rise = there.chi2 - least
+    H, H_here = there.normal_equations()[0], here.normal_equations()[0]
     offset = poses.difference(moved, T)
-    C, _ = covariance_from_information(there.normal_equations()[0], model.size_mm)
+    C, _ = covariance_from_information(H, model.size_mm)
     variance = np.einsum("bii->bi", C)
     error2 = np.stack([(offset[:, part] ** 2).sum(axis=1) for part in (slice(3), slice(3, 6))], axis=1)
     own2 = np.stack([variance[:, part].sum(axis=1) for part in (slice(3), slice(3, 6))], axis=1)
-    return np.where(np.isfinite(rise), rise, 9.0), offset, np.sqrt((error2 / np.maximum(own2, 1e-300)).max(axis=1))
+    rise = there.chi2 - here.chi2[0]
+    room = 0.5 * (np.linalg.slogdet(basis.T @ H_here @ basis)[1] - np.linalg.slogdet(basis.T @ H @ basis)[1])
+    return _Profile(
+        step=steps,
+        rise=np.where(np.isfinite(rise), rise, _NO_WAY),
+        offset=offset,
+        surprise=np.sqrt((error2 / np.maximum(own2, 1e-300)).max(axis=1)),
+        log_room=room,
+    )

@@ -60,7 +60,7 @@ _VOTES_WITHIN = 25.0
 #: rivals within this many nats of the best are kept for the verdict (a good deal more than the verdict's own 100 : 1)
 _KEEP_WITHIN = 12.0
 #: fewer matches are looked for while they could come this near the best: what the verdict asks of a rival, and a nat
-_RIVALS_WITHIN = 7.5
+_RIVALS_WITHIN = 6.0
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
 #: voted hypotheses looked at for a vote that spoils them, the score they need (ln odds, roughly), and the χ²
@@ -76,6 +76,8 @@ _VERIFY_STEPS = (12, 6)
 _CHUNK = 12_000
 #: so many spot triples of one rod triple are worth a call of their own
 _ALONE = 3_000
+#: two crossings nearer than this share of the frame's size may leave one spot, where nothing tells how large spots are
+_UNRESOLVED = 0.02
 #: above this many spots a tree finds the nearest
 _MANY_SPOTS = 32
 
@@ -94,6 +96,8 @@ class Scene:
     half_slab_mm: float = 0.0
     #: (2, 2) lower and upper corner of the image, mm; None: unbounded
     field_mm: FloatArray | None = None
+    #: how near two rods' crossings may come and leave two spots, mm; None: judged by the frame's size
+    resolved_mm: float | None = None
 
     def restricted(self, spots: IntArray) -> Scene:
         """The scene with only these spots."""
@@ -104,6 +108,7 @@ class Scene:
             brightness=None if self.brightness is None else self.brightness[spots],
             half_slab_mm=self.half_slab_mm,
             field_mm=self.field_mm,
+            resolved_mm=self.resolved_mm,
         )
 
 
@@ -555,9 +560,19 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
     projection = project(T, model.starts, model.directions)
     may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
     matched = spot_of_rod >= 0
-    must &= ~_merged(model, scene, fit.predicted_px, matched, must)
+    merged = _merged(model, scene, fit.predicted_px, matched, must)
+    must &= ~merged
     odds = log_odds(
-        model, scene.prior, scene.xy_mm, T, fit, matched, must, brightness=scene.brightness, spot_of_rod=spot_of_rod
+        model,
+        scene.prior,
+        scene.xy_mm,
+        T,
+        fit,
+        matched,
+        must,
+        brightness=scene.brightness,
+        spot_of_rod=spot_of_rod,
+        merged=merged,
     )
     good = (
         np.isfinite(odds)
@@ -572,9 +587,8 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
 
 
 def _merged(model: RodModel, scene: Scene, crossing_mm: FloatArray, matched: BoolArray, must: BoolArray) -> BoolArray:
-    """Rods whose crossing falls on a matched rod's: their two spots are one, and it has been given away."""
-    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
-    reach = 2 * max(diameters) if diameters else 0.05 * model.size_mm
+    """Rods whose crossing falls on a matched rod's: their two spots may be one, and it has been given away."""
+    reach = scene.resolved_mm if scene.resolved_mm is not None else _UNRESOLVED * model.size_mm
     gap = np.linalg.norm(crossing_mm[:, :, None] - crossing_mm[:, None, :], axis=-1)
     close = (gap < reach) & matched[:, None, :] & ~np.eye(len(model), dtype=bool)
     merged: BoolArray = close.any(axis=2) & must & ~matched

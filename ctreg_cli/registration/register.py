@@ -31,19 +31,18 @@ from ctreg_cli.scale import Scale
 #: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed
 #: this (ln): chance is a rival like any other ...
 ACCEPT_LOG_ODDS = math.log(100)
-#: ... and more for each spot left over: in dense clutter chance matches crowd up to what Markov's inequality allows
-#: them, among few spots they stay far below (measured by benchmarks/accuracy.py, table ``clutter``)
-ACCEPT_LOG_ODDS_PER_FREE_SPOT = 0.12
+#: ... and more for each spot left over beyond a few: in dense clutter chance matches crowd up to what Markov's
+#: inequality allows them, among few spots they stay far below (measured by benchmarks/accuracy.py, table ``clutter``)
+ACCEPT_LOG_ODDS_PER_FREE_SPOT, FEW_FREE_SPOTS = 0.12, 6
 #: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
 ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
-#: a rival within these odds of the best makes the slice ambiguous (contract §5)
-RIVAL_ODDS = 100.0
-#: ln odds within which a rival counts that is the best match without one of its spots, where spots are false
-_FRAGILE_LOG_ODDS = 5.3
-#: ... and that explains all of the same spots: twins are no chance, they come with the geometry
-_TWIN_LOG_ODDS = 7.0
-#: ... when its pose is farther off than this many standard deviations (contract §5)
+#: rivals that together come within these ln odds of the best make the slice ambiguous: the contract's 100 : 1 (§5), and
+#: half a nat by which Laplace's method may be off
+RIVAL_LOG_ODDS = math.log(100) + 0.5
+#: ... when their poses are farther off than this many standard deviations (contract §5)
 RIVAL_SD = 6.0
+#: rivals farther behind (ln odds) than this do not count
+_NO_RIVAL_LOG_ODDS = 8.0
 #: a fit with a smaller χ² probability is refused
 BAD_FIT_P = 1e-4
 #: spots beside the places of missing rods: refused when chance would put them so near less often than this
@@ -103,7 +102,16 @@ def make_scene(
         brightness=spots.contrast if len(spots) and np.isfinite(spots.contrast).all() else None,
         half_slab_mm=0.5 * thickness_mm if thickness_mm is not None else 0.0,
         field_mm=field,
+        resolved_mm=_resolved_mm(spots, model, scale),
     )
+
+
+def _resolved_mm(spots: Spots, model: RodModel, scale: Scale) -> float | None:
+    """Twice the width of a spot, as it is seen or else as the rods are drawn; None where nothing tells it."""
+    if len(spots) and np.isfinite(spots.minor_px).all():
+        return 2 * float(np.median(spots.minor_px) * scale.mm_per_px.mean())
+    diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
+    return 2 * max(diameters) if diameters else None
 
 
 def register(
@@ -129,8 +137,8 @@ def register(
 
     Returns:
         The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²),
-        leaves no more rods unexplained than it explains, no other pose comes within odds of 100 : 1 (1000 : 1 where it
-        explains all of the same spots), and a covariance describes what the spots leave open.
+        leaves no more rods unexplained than it explains, no other pose comes within :data:`RIVAL_LOG_ODDS`, and a
+        covariance describes what the spots leave open.
     """
     options = options or RegistrationOptions()
     scene = make_scene(
@@ -202,7 +210,7 @@ def _log_others(matches: Matches) -> float:
 def accepted_log_odds(n_matches: int, n_spots: int) -> float:
     """The ln odds that a match of so many of the slice's spots must exceed."""
     least = ACCEPT_LOG_ODDS if n_matches > LEAST_MATCHES else ACCEPT_LOG_ODDS_OF_FOUR
-    return least + ACCEPT_LOG_ODDS_PER_FREE_SPOT * (n_spots - n_matches)
+    return least + ACCEPT_LOG_ODDS_PER_FREE_SPOT * max(0, n_spots - n_matches - FEW_FREE_SPOTS)
 
 
 def decide(
@@ -216,10 +224,9 @@ def decide(
     """The verdict on a slice's matches, best first."""
     options = options or RegistrationOptions()
     candidates = refined_candidates(
-        model, scene, spots, scale, matches.subset(matches.log_odds > matches.log_odds[0] - _TWIN_LOG_ODDS)
+        model, scene, spots, scale, matches.subset(matches.log_odds > matches.log_odds[0] - _NO_RIVAL_LOG_ODDS)
     )
     best = candidates[0]
-    free = len(spots) > len(best.rod_index)
 
     def refused(reason: str) -> Registration:
         return Registration(status="no_pose", reason=reason, n_spots=len(spots))
@@ -240,14 +247,7 @@ def decide(
         return refused("bad_fit")
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
-    near = [c for c in candidates[1:] if c.log_odds > best.log_odds - math.log(RIVAL_ODDS)]
-    doubts = [c for c in near if _knows_less(c, best) or pose_distance_sd(best, c) <= RIVAL_SD]
-    rivals = [c for c in near if not any(c is d for d in doubts)]
-    if free and not rivals:
-        fragile = best.log_odds - _FRAGILE_LOG_ODDS
-        rivals = [c for c in candidates[1:] if c.log_odds > fragile and _hangs_on_one_spot(best, c)]
-    if not rivals:
-        rivals = [c for c in candidates[1:] if _is_twin(best, c)]
+    doubts, rivals = _doubts_and_rivals(candidates)
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
@@ -290,6 +290,20 @@ def decide(
             warnings=tuple(warnings),
         )
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
+
+
+def _doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+    """What else explains the spots: variants of the best match that do not contradict it, and poses that do.
+
+    The rivals are one of each pose, and none where all of them together are too improbable to count.
+    """
+    best, others = candidates[0], candidates[1:]
+    agrees = [_knows_less(c, best) or pose_distance_sd(best, c) <= RIVAL_SD for c in others]
+    near = best.log_odds - RIVAL_LOG_ODDS
+    doubts = [c for c, agreed in zip(others, agrees, strict=True) if agreed and c.log_odds > near]
+    rivals = _distinct_poses([c for c, agreed in zip(others, agrees, strict=True) if not agreed])
+    weight = sum(math.exp(c.log_odds - best.log_odds) for c in rivals)
+    return doubts, rivals if weight > math.exp(-RIVAL_LOG_ODDS) else []
 
 
 def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
@@ -432,22 +446,6 @@ def assemble_candidate(
         inflation=inflation,
         iterations=steps,
     )
-
-
-def _hangs_on_one_spot(best: Candidate, c: Candidate) -> bool:
-    """Whether ``c`` is ``best`` without one spot, at a pose that contradicts it.
-
-    Where spots are false, one of them can complete a wrong pose out of true ones, at odds no density of clutter
-    foresees: a pose that a single spot decides needs 200 : 1.
-    """
-    one_less = len(c.rod_index) == len(best.rod_index) - 1 and _matches(c) < _matches(best)
-    return one_less and not _knows_less(c, best) and pose_distance_sd(best, c) > RIVAL_SD
-
-
-def _is_twin(best: Candidate, c: Candidate) -> bool:
-    """Whether ``c`` explains all of the same spots at a pose that contradicts ``best``."""
-    same_spots = set(best.spot_index.tolist()) <= set(c.spot_index.tolist())
-    return same_spots and pose_distance_sd(best, c) > RIVAL_SD
 
 
 def _matches(c: Candidate) -> set[tuple[int, int]]:
