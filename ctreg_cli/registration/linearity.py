@@ -14,6 +14,7 @@ import numpy as np
 
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry import pose as poses
+from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 
@@ -27,12 +28,20 @@ _MOST_WIDENED = 2.5
 _WRONG_SD, _WRONG_P = 6.0, 0.02
 #: points of the profile on each side
 _POINTS = 8
+#: how far beyond its ends (frame sizes) a matched rod may be cut for the truth to lie there
+_BEYOND_END = 0.02
 #: rise where a rod no longer crosses the slice, and ln of the room beyond which Laplace's method is not believed
 _NO_WAY, _MOST_ROOM = 9.0, 30.0
 
 
 def covariance_along_the_valley(
-    model: RodModel, T: FloatArray, covariance: FloatArray, seen: Observations, *, inflation: float = 1.0
+    model: RodModel,
+    T: FloatArray,
+    covariance: FloatArray,
+    seen: Observations,
+    *,
+    inflation: float = 1.0,
+    prior: PosePrior | None = None,
 ) -> tuple[FloatArray | None, float]:
     """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
 
@@ -45,6 +54,7 @@ def covariance_along_the_valley(
         covariance: (6, 6) what its curvature there says, mm and rad, times ``inflation²``.
         seen: one hypothesis: the spots the pose rests on.
         inflation: factor by which spots lie farther off than their sd allows.
+        prior: what is known of the pose without the spots; None: nothing.
 
     Returns:
         ``covariance`` itself where it is true; a wider one, with the factor; or None where no ellipsoid describes what
@@ -57,7 +67,7 @@ def covariance_along_the_valley(
     sd = math.sqrt(max(float(values[-1]), 0.0))
 
     inward = np.linspace(3, 0, _POINTS, endpoint=False)
-    profile = _profile(model, T, seen, axes, sd * np.concatenate([inward, -inward]))
+    profile = _profile(model, T, seen, axes, sd * np.concatenate([inward, -inward]), prior)
     if profile.wrong_share() > _WRONG_P:
         return None, math.inf
     rise, offset = profile.rise, profile.offset
@@ -67,7 +77,7 @@ def covariance_along_the_valley(
         return covariance, 1.0
 
     factors = np.linspace(1, _MOST_WIDENED, _POINTS)
-    outward = _profile(model, T, seen, axes, 3 * sd * np.concatenate([factors, -factors]))
+    outward = _profile(model, T, seen, axes, 3 * sd * np.concatenate([factors, -factors]), prior)
     risen = np.maximum.accumulate(outward.rise.reshape(2, -1), axis=1) >= 9
     if not risen.any(axis=1).all() or profile.joined(outward).wrong_share() > _WRONG_P:
         return None, math.inf
@@ -98,7 +108,7 @@ class _Profile:
     #: (b,) how many sd *of there* the pose is off, in rotation or place: what its error would be called were the truth
     #: there
     surprise: FloatArray
-    #: (b,) ln of how much room the other five directions leave there, over that at the pose
+    #: (b,) ln of how much room the other five directions leave there, times the prior density, over that at the pose
     log_room: FloatArray
 
     def joined(self, other: _Profile) -> _Profile:
@@ -120,7 +130,14 @@ class _Profile:
         return float(half @ (wrong[1:] + wrong[:-1])) / float(half @ (density[1:] + density[:-1]))
 
 
-def _profile(model: RodModel, T: FloatArray, seen: Observations, axes: FloatArray, steps: FloatArray) -> _Profile:
+def _profile(
+    model: RodModel,
+    T: FloatArray,
+    seen: Observations,
+    axes: FloatArray,
+    steps: FloatArray,
+    prior: PosePrior | None,
+) -> _Profile:
     """Follow the last of ``axes`` (6, 6) by ``steps`` (b,) while the others give way."""
     b = len(steps)
     repeated = replace(
@@ -146,6 +163,11 @@ def _profile(model: RodModel, T: FloatArray, seen: Observations, axes: FloatArra
     own2 = np.stack([variance[:, part].sum(axis=1) for part in (slice(3), slice(3, 6))], axis=1)
     rise = there.chi2 - here.chi2[0]
     room = 0.5 * (np.linalg.slogdet(basis.T @ H_here @ basis)[1] - np.linalg.slogdet(basis.T @ H @ basis)[1])
+    if prior is not None:
+        room += prior.log_density(moved[:, :3, :3]) - prior.log_density(T[None, :3, :3])
+    beyond = np.maximum(-there.lambda_mm, there.lambda_mm - model.lengths) - seen.half_slab_mm
+    cut = (beyond < _BEYOND_END * model.size_mm) | ~seen.matched
+    room = np.where(cut.all(axis=1), room, -_MOST_ROOM)
     return _Profile(
         step=steps,
         rise=np.where(np.isfinite(rise), rise, _NO_WAY),

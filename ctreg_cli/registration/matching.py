@@ -50,7 +50,7 @@ LEAST_CHECKED = 4
 #: how many triples of any five rods or more are tried
 _COVER = 2
 #: ln odds beyond which a match is no chance (10⁹ : 1, Lang et al. 2010): only its own spots can tell another story
-_BEYOND_CHANCE = math.log(1e9)
+BEYOND_CHANCE = math.log(1e9)
 #: hypotheses a stage hands on to refinement
 _KEEP_PER_STAGE = 40
 #: ... and one that only asks whether a match beyond chance has a rival
@@ -61,6 +61,8 @@ _VOTES_WITHIN = 25.0
 _KEEP_WITHIN = 12.0
 #: fewer matches are looked for while they could come this near the best: what the verdict asks of a rival, and a nat
 _RIVALS_WITHIN = 6.0
+#: a second frame is looked for that leaves at most so many spots fewer than the first
+_SECOND_FRAME_LACKS = 2
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
 #: voted hypotheses looked at for a vote that spoils them, the score they need (ln odds, roughly), and the χ²
@@ -256,7 +258,7 @@ def _covering_order(n: int, triples: IntArray, worth: FloatArray) -> tuple[IntAr
 def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches | None:
     """All matches worth a verdict, best first; None when no pose gathers ``least_matches`` spots.
 
-    Once a match beats chance by :data:`_BEYOND_CHANCE`, no rival is left to chance either: it would have to share spots
+    Once a match beats chance by :data:`BEYOND_CHANCE`, no rival is left to chance either: it would have to share spots
     with it, so that only triples of its own spots are tried further, and the spots left over for a second frame.
     """
     m = len(scene.xy_mm)
@@ -282,9 +284,9 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
             found.append(part)
             if best is None or part.log_odds[0] > best.log_odds[0]:
                 best = part.subset(np.array([0]))
-                if best.log_odds[0] > _BEYOND_CHANCE:
+                if best.log_odds[0] > BEYOND_CHANCE:
                     start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
-    if best is not None and best.log_odds[0] > _BEYOND_CHANCE:
+    if best is not None and best.log_odds[0] > BEYOND_CHANCE:
         second = _second_frame(model, scene, best, least_matches)
         if second is not None:
             found.append(second)
@@ -294,16 +296,16 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
 
 
 def _second_frame(model: RodModel, scene: Scene, best: Matches, least_matches: int) -> Matches | None:
-    """A match as good as ``best`` among the spots it leaves over; not looked for in a field of clutter."""
+    """A match nearly as good as ``best`` among the spots it leaves over; not looked for in a field of clutter."""
     free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_of_rod[0])
     if len(free) > _MANY_SPOTS:
         return None
-    enough = [k for k in range(least_matches, min(len(model), len(free)) + 1) if _could_rival(scene, best, k)]
-    if not enough:
+    enough = max(least_matches, int((best.spot_of_rod[0] >= 0).sum()) - _SECOND_FRAME_LACKS)
+    if enough > min(len(model), len(free)):
         return None
     layout = plan(model)
-    triples = layout.triples[: layout.prefix[enough[0]]]
-    return _search_triples(model, scene, triples, free, enough[0], set(), most=_KEEP_TO_CONFIRM)
+    triples = layout.triples[: layout.prefix[enough]]
+    return _search_triples(model, scene, triples, free, enough, set(), most=_KEEP_TO_CONFIRM)
 
 
 def _could_rival(scene: Scene, best: Matches, k: int) -> bool:
@@ -368,7 +370,7 @@ def _search_triples(
     if not top:
         return None
     verified = verify(model, scene, T[top], spot_of_rod[top], least_matches)
-    if verified is not None and verified.log_odds[0] > _BEYOND_CHANCE:
+    if verified is not None and verified.log_odds[0] > BEYOND_CHANCE:
         return verified
     hopeful = [i for i in top[:_REPAIRED] if score[i] > _WORTH_REPAIR]
     repaired = _repair(model, scene, T[hopeful], spot_of_rod[hopeful], least_matches) if hopeful else None
@@ -657,17 +659,34 @@ def nearest_assignment(model: RodModel, scene: Scene, T: FloatArray, covariance:
 
 
 def distinct(model: RodModel, matches: Matches, *, within: float = _KEEP_WITHIN, most: int = 24) -> Matches:
-    """The best of each pose: hypotheses within ``within`` nats of the best that differ in pose or in matches."""
+    """The best of each pose: hypotheses within ``within`` nats of the best that differ in pose or in matches.
+
+    A second frame, beyond chance and of other spots than the best, stays however far behind.
+    """
     keep: list[int] = []
     for i in range(len(matches)):
-        if matches.log_odds[i] < matches.log_odds[0] - within or len(keep) >= most:
+        if len(keep) >= most:
             break
+        far_behind = matches.log_odds[i] < matches.log_odds[0] - within
+        if far_behind and not is_second_frame(matches.spot_of_rod[0], matches.spot_of_rod[i], matches.log_odds[i]):
+            continue
         if not any(
             (matches.spot_of_rod[i] == matches.spot_of_rod[j]).all() and _same(model, matches.T[i], matches.T[j])
             for j in keep
         ):
             keep.append(i)
     return matches.subset(np.array(keep, dtype=np.intp))
+
+
+def is_second_frame(best: IntArray, other: IntArray, log_odds: float) -> bool:
+    """Whether a match is no chance and has no spot in common with the best: another frame of the same make.
+
+    Args:
+        best: spots of the best match, −1 for none.
+        other: spots of the match in question.
+        log_odds: its ln odds.
+    """
+    return log_odds > BEYOND_CHANCE and not np.isin(other[other >= 0], best).any()
 
 
 def _same(model: RodModel, T_a: FloatArray, T_b: FloatArray) -> bool:

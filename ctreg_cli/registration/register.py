@@ -15,7 +15,7 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.integrity import protection_levels
 from ctreg_cli.registration.linearity import covariance_along_the_valley, positive_part
-from ctreg_cli.registration.matching import Matches, Scene, doubt, observations, search
+from ctreg_cli.registration.matching import Matches, Scene, doubt, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import (
@@ -41,6 +41,8 @@ ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
 RIVAL_LOG_ODDS = math.log(100) + 0.5
 #: ... when their poses are farther off than this many standard deviations (contract §5)
 RIVAL_SD = 6.0
+#: translation and rotation in a twist
+_PARTS = (slice(3), slice(3, 6))
 #: rivals farther behind (ln odds) than this do not count
 _NO_RIVAL_LOG_ODDS = 8.0
 #: a fit with a smaller χ² probability is refused
@@ -223,9 +225,12 @@ def decide(
 ) -> Registration:
     """The verdict on a slice's matches, best first."""
     options = options or RegistrationOptions()
-    candidates = refined_candidates(
-        model, scene, spots, scale, matches.subset(matches.log_odds > matches.log_odds[0] - _NO_RIVAL_LOG_ODDS)
-    )
+    first = matches.spot_of_rod[0]
+    near = [
+        odds > matches.log_odds[0] - _NO_RIVAL_LOG_ODDS or is_second_frame(first, other, odds)
+        for other, odds in zip(matches.spot_of_rod, matches.log_odds, strict=True)
+    ]
+    candidates = refined_candidates(model, scene, spots, scale, matches.subset(np.array(near)))
     best = candidates[0]
 
     def refused(reason: str) -> Registration:
@@ -252,7 +257,12 @@ def decide(
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
     covariance, factor = covariance_along_the_valley(
-        model, best.T_slice_model, best.covariance, _seen_by(model, scene, best), inflation=best.inflation
+        model,
+        best.T_slice_model,
+        best.covariance,
+        _seen_by(model, scene, best),
+        inflation=best.inflation,
+        prior=scene.prior,
     )
     if covariance is None:
         return Registration(
@@ -298,12 +308,13 @@ def _doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], li
     The rivals are one of each pose, and none where all of them together are too improbable to count.
     """
     best, others = candidates[0], candidates[1:]
-    agrees = [_knows_less(c, best) or pose_distance_sd(best, c) <= RIVAL_SD for c in others]
+    agrees = [_knows_less(c, best) or (pose_distance_sd(best, c) <= RIVAL_SD and not _refutes(c, best)) for c in others]
     near = best.log_odds - RIVAL_LOG_ODDS
     doubts = [c for c, agreed in zip(others, agrees, strict=True) if agreed and c.log_odds > near]
     rivals = _distinct_poses([c for c, agreed in zip(others, agrees, strict=True) if not agreed])
     weight = sum(math.exp(c.log_odds - best.log_odds) for c in rivals)
-    return doubts, rivals if weight > math.exp(-RIVAL_LOG_ODDS) else []
+    second = any(is_second_frame(best.spot_index, c.spot_index, c.log_odds) for c in rivals)
+    return doubts, rivals if second or weight > math.exp(-RIVAL_LOG_ODDS) else []
 
 
 def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
@@ -459,6 +470,13 @@ def _knows_less(c: Candidate, best: Candidate) -> bool:
     twist = poses.difference(c.T_slice_model, best.T_slice_model)
     both = np.linalg.pinv(best.covariance + c.covariance, hermitian=True)
     return float(twist @ both @ twist) <= RIVAL_SD**2
+
+
+def _refutes(c: Candidate, best: Candidate) -> bool:
+    """Whether ``best`` would be called wrong if ``c`` were the truth: more than six of its sd off, turned or moved."""
+    twist = poses.difference(best.T_slice_model, c.T_slice_model)
+    variance = np.diag(c.covariance)
+    return any(float(twist[part] @ twist[part]) > RIVAL_SD**2 * float(variance[part].sum()) for part in _PARTS)
 
 
 def averaged(best: Candidate, doubts: list[Candidate]) -> tuple[Candidate, float]:
