@@ -252,7 +252,7 @@ def decide(
         return refused("bad_fit")
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
-    doubts, rivals = _doubts_and_rivals(candidates)
+    doubts, rivals = doubts_and_rivals(candidates)
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
@@ -302,7 +302,7 @@ def decide(
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
 
 
-def _doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+def doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
     """What else explains the spots: variants of the best match that do not contradict it, and poses that do.
 
     The rivals are one of each pose, and none where all of them together are too improbable to count.

@@ -92,3 +92,25 @@ def test_chance_matches_obey_markovs_inequality() -> None:
         best.append(-np.inf if found is None else float(found.log_odds[0]))
     for x in (1.0, 2.0, 3.0):
         assert np.mean(np.array(best) > x) <= math.exp(-x) + 2 * math.sqrt(math.exp(-x) / len(best)), x
+
+
+def test_a_rod_beside_a_matched_one_is_half_expected() -> None:
+    """Of two rods without a spot, the one whose crossing falls on a matched rod's costs a match less."""
+    rng = np.random.default_rng(905)
+    frame = random_frame(rng, 7)
+    world = some_scene(rng, frame, sd_px=0.1, least=7)
+    model = model_of(frame)
+    prior = PosePrior.of_rods(model.directions)
+    xy = world.uv_px * world.mm_per_px
+    scene = Scene(xy_mm=xy, covariance_mm=np.tile(np.eye(2) * 0.05**2, (len(xy), 1, 1)), prior=prior)
+    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
+    spot_of_rod[0, world.rod_of_spot] = np.arange(len(xy))
+    spot_of_rod[0, 0] = -1
+    matched = spot_of_rod >= 0
+    T, fit, _ = refine(model, world.T[None], observations(scene, spot_of_rod), iterations=30)
+    all_cut, first = np.ones_like(matched), np.arange(len(model))[None] == 0
+    unseen = float(log_odds(model, prior, xy, T, fit, matched, all_cut)[0])
+    beside = float(log_odds(model, prior, xy, T, fit, matched, all_cut & ~first, merged=first)[0])
+    not_cut = float(log_odds(model, prior, xy, T, fit, matched, all_cut & ~first)[0])
+    assert unseen < beside < not_cut
+    assert beside - not_cut == pytest.approx(math.log(0.5), abs=0.1)  # but for the neighbourhood, which loses a rod

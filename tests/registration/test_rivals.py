@@ -1,0 +1,78 @@
+"""What is said of several poses that explain the spots: the odds of all rivals together decide."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from ctreg_cli.arrays import frozen, frozen_index
+from ctreg_cli.geometry import pose as poses
+from ctreg_cli.registration.register import RIVAL_LOG_ODDS, accepted_log_odds, doubts_and_rivals
+from ctreg_cli.registration.result import Candidate
+
+
+def candidate(
+    log_odds: float, *, turn_deg: float = 0.0, sd_deg: float = 0.1, spots: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+) -> Candidate:
+    """A pose turned about x, with as many matches as spots."""
+    T = poses.make_pose(poses.exp_rotation(np.array([math.radians(turn_deg), 0, 0])), np.zeros(3))
+    variance = np.array([0.01, 0.01, 0.01, *(3 * [math.radians(sd_deg) ** 2])])
+    return Candidate(
+        T_slice_model=frozen(T, (4, 4)),
+        covariance=frozen(np.diag(variance), (6, 6)),
+        rod_index=frozen_index(np.arange(len(spots))),
+        spot_index=frozen_index(np.array(spots)),
+        residual_px=frozen(np.zeros((len(spots), 2)), (None, 2)),
+        lambda_mm=frozen(np.ones(len(spots)), (None,)),
+        missing_rods=frozen_index([]),
+        rms_px=0.0,
+        chi2=1.0,
+        degrees_of_freedom=2 * len(spots) - 6,
+        log_odds=log_odds,
+    )
+
+
+def test_a_rival_counts_by_its_odds() -> None:
+    best = candidate(20.0)
+    near = candidate(20.0 - RIVAL_LOG_ODDS + 0.1, turn_deg=30)
+    far = candidate(20.0 - RIVAL_LOG_ODDS - 0.1, turn_deg=30)
+    assert doubts_and_rivals([best, near]) == ([], [near])
+    assert doubts_and_rivals([best, far]) == ([], [])
+
+
+def test_rivals_too_improbable_alone_count_together_if_they_are_several_poses() -> None:
+    best = candidate(20.0)
+    half = 20.0 - RIVAL_LOG_ODDS - 0.5 * math.log(2)
+    one, other, again = candidate(half, turn_deg=30), candidate(half, turn_deg=-30), candidate(half, turn_deg=30.1)
+    assert doubts_and_rivals([best, one, other]) == ([], [one, other])
+    assert doubts_and_rivals([best, one, again]) == ([], [])
+
+
+def test_a_vague_pose_cannot_swallow_a_sharp_one() -> None:
+    """Within six sd of the best, but the best is beyond six of *its* sd: were it the truth, ``ok`` would be wrong."""
+    best = candidate(20.0, sd_deg=5.0)
+    sharp = candidate(18.0, turn_deg=10, sd_deg=0.5)
+    vague = candidate(18.0, turn_deg=10, sd_deg=5.0)
+    assert doubts_and_rivals([best, sharp]) == ([], [sharp])
+    assert doubts_and_rivals([best, vague]) == ([vague], [])
+
+
+def test_another_frame_of_other_spots_is_a_rival_whatever_its_odds() -> None:
+    best = candidate(60.0)
+    second = candidate(30.0, turn_deg=30, spots=(6, 7, 8, 9, 10, 11))
+    of_the_same = candidate(30.0, turn_deg=30, spots=(5, 7, 8, 9, 10, 11))
+    chance = candidate(10.0, turn_deg=30, spots=(6, 7, 8, 9, 10, 11))
+    assert doubts_and_rivals([best, second]) == ([], [second])
+    assert doubts_and_rivals([best, of_the_same]) == ([], [])
+    assert doubts_and_rivals([best, chance]) == ([], [])
+
+
+@pytest.mark.parametrize("matches", [4, 5, 9])
+def test_more_is_asked_among_more_clutter_and_of_four_matches(matches: int) -> None:
+    asked = [accepted_log_odds(matches, matches + free) for free in range(40)]
+    assert all(b >= a for a, b in itertools.pairwise(asked))
+    assert asked[-1] > asked[0] >= math.log(100)
+    assert accepted_log_odds(4, 4) > accepted_log_odds(5, 5)
