@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +34,15 @@ from ctreg_cli.registration.labelled import register_labelled
 from ctreg_cli.registration.matching import doubt, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
-from ctreg_cli.rods import Rod, RodModel, Target
+from ctreg_cli.registration.twins import with_twins
+from ctreg_cli.rods import Mount, Rod, RodModel, Target
 from ctreg_cli.scale import Scale
 from tests.oracle import (
     OracleFrame,
     OracleScene,
     bound,
     cross_line,
+    cross_rod,
     numeric_jacobian,
     random_frame,
     scene,
@@ -215,7 +217,7 @@ def is_decidable(frame: OracleFrame, world: OracleScene, model: RodModel) -> boo
     pool = search(model, place, least_matches=4)
     if pool is None:
         return True
-    pool = doubt(model, place, pool, least_matches=4)
+    pool = with_twins(model, place, doubt(model, place, pool, least_matches=4), 4)
     for T, spot_of_rod in zip(pool.T, pool.spot_of_rod, strict=True):
         twist = twist_error(T[:3, :3], T[:3, 3], R, t)
         if math.sqrt(twist @ np.linalg.pinv(own, hermitian=True) @ twist) > 6:
@@ -277,6 +279,67 @@ def table_labelled(share: float, seed: int) -> None:
     rows = [(n, noise, int(2000 * share) or 5, seed) for n in range(4, 13) for noise in (0.05, 0.3, 1.0)]
     with ProcessPoolExecutor() as pool:
         for line in pool.map(run_labelled, rows):
+            print(line, flush=True)
+
+
+DESIGNS = ("leksell-g-2-panel", "z-frame-z001", "z-frame-elongated", "plus-fcal-2.0")
+
+
+def run_design(arguments: tuple[str, int, int]) -> str:
+    """One row of the table of known frames: drawn exactly, every rod that is cut seen, at 0.1 px and 0.5 mm/px."""
+    name, count, seed = arguments
+    shipped = load_rod_model(name)
+    rods = tuple(replace(rod, tolerance_mm=0.0) for rod in shipped.rods)
+    # wires along y where there is no mount: they cross the slice
+    nominal = (
+        np.array(shipped.mount.patient_from_model) if shipped.mount else np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    )
+    model = RodModel(name=name, rods=rods, mount=Mount(patient_from_model=nominal, max_angle_deg=45))
+    frame = OracleFrame(np.array(model.starts), np.array(model.ends))
+    rng = np.random.default_rng([seed, *name.encode()])
+    noise, s = 0.1, np.array([0.5, 0.5])
+    ratio, own = [], []
+    tally: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
+    while sum(tally[True].values()) < count:
+        R = Rotation.from_rotvec(rng.normal(size=3) * [0.1, 0.1, 0.2]).as_matrix() @ nominal
+        share = rng.uniform(0.25, 0.75, (len(frame), 1))
+        inside = ((1 - share) * frame.starts + share * frame.ends)[rng.integers(len(frame))]
+        t = np.append(s * 250, 0.0) - R @ inside
+        hits = [cross_rod(a, b, R, t) for a, b in zip(frame.starts, frame.ends, strict=True)]
+        seen = [i for i, hit in enumerate(hits) if hit is not None and 0.03 < hit[1] < 0.97]
+        if len(seen) < len(frame):
+            continue
+        true = np.array([hit[0] / s for hit in hits if hit is not None])
+        uv = true + rng.normal(size=true.shape) * noise
+        C = bound(frame, seen, R, t, s, noise)
+        world = OracleScene(R, t, uv, noise, np.array(seen), s, C, seen)
+        spots = Spots.from_points(uv, noise)
+        found = register_labelled(spots, world.rod_of_spot, model, scale=scale_of(world))
+        # of several exact answers the one that was meant: the mount tells them apart
+        best = min(found, key=lambda c: errors(c.T_slice_model, frame, world)[0])
+        twist = errors(best.T_slice_model, frame, world)[2]
+        if best.linear:
+            ratio.append(twist @ np.linalg.pinv(C, hermitian=True) @ twist / 6)
+            own.append(twist @ np.linalg.pinv(best.covariance, hermitian=True) @ twist / 6)
+        for mounted, verdicts in tally.items():
+            result = register(spots, model, scale=scale_of(world), options=RegistrationOptions(use_mount=mounted))
+            verdicts[result.status] += 1
+            verdicts["wrong"] += result.status == "ok" and is_wrong(result.candidates[0].T_slice_model, frame, world)
+    mounted, free = ({k: v for k, v in sorted(tally[m].items()) if v} for m in (True, False))
+    return (
+        f"  {name:18s} {count:6d}   {math.sqrt(np.mean(ratio)):17.3f}   {np.mean(own):17.3f}   {count - len(ratio):10d}"
+        f"   mount {mounted}, none {free}"
+    )
+
+
+def table_designs(share: float, seed: int) -> None:
+    """Frames with a twin, or with parallel wires: at the bound with labels, and what is said without."""
+    print(
+        "known frames drawn exactly, all rods seen, 0.1 px: with labels, and then without, with the mount and without"
+    )
+    print("  frame              scenes   rms error / bound   (error / own sd)²   not linear")
+    with ProcessPoolExecutor() as pool:
+        for line in pool.map(run_design, [(name, int(2000 * share) or 5, seed) for name in DESIGNS]):
             print(line, flush=True)
 
 
@@ -566,6 +629,7 @@ def table_leksell(share: float, seed: int) -> None:
 TABLES: dict[str, Callable[[float, int], None]] = {
     "labelled": table_labelled,
     "calibration": table_calibration,
+    "designs": table_designs,
     "matching": table_matching,
     "clutter": table_clutter,
     "grid": table_grid,

@@ -25,6 +25,7 @@ from ctreg_cli.registration.refine import (
     refine,
 )
 from ctreg_cli.registration.result import Candidate, Registration
+from ctreg_cli.registration.twins import with_twins
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
@@ -152,7 +153,7 @@ def register(
     matches = search(model, scene, least_matches=least)
     if matches is None:
         return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
-    matches = doubt(model, scene, matches, least_matches=least)
+    matches = with_twins(model, scene, doubt(model, scene, matches, least_matches=least), least)
     return decide(model, scene, spots, scale, matches, options)
 
 

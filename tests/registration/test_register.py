@@ -274,3 +274,15 @@ def test_a_spot_beside_two_rods_is_tried_with_both() -> None:
             wrong += bool(error @ np.linalg.inv(result.candidates[0].covariance) @ error > 36)
     assert wrong == 0
     assert checked >= 3
+
+
+@pytest.mark.parametrize("seed", [13, 33, 45, 49, 73, 75, *range(6)])
+def test_an_exact_twin_is_never_overlooked(seed: int) -> None:
+    """Noise took from the search, in the first six, every root that leads to the twin; the frame's symmetry knows it."""
+    rng = np.random.default_rng([811, seed])
+    frame = frame_of(load_rod_model("z-frame-z001"))
+    world = some_scene(rng, frame, sd_px=0.1, least=7, tilt_rad=0.15, height=(0.25, 0.75))
+    result = registered(world, model_of(frame))
+    assert result.status == "ambiguous", (seed, result.reason)
+    error = [error_of(c.T_slice_model, world) for c in result.candidates]
+    assert min(np.sqrt(e @ np.linalg.pinv(world.bound) @ e) for e in error) < 6, seed
