@@ -278,7 +278,7 @@ def test_a_spot_beside_two_rods_is_tried_with_both() -> None:
 
 @pytest.mark.parametrize("seed", [13, 33, 45, 49, 73, 75, *range(6)])
 def test_an_exact_twin_is_never_overlooked(seed: int) -> None:
-    """Noise took from the search, in the first six, every root that leads to the twin; the frame's symmetry knows it."""
+    """In the first six, noise took from the search every root that leads to the twin; the symmetry knows it."""
     rng = np.random.default_rng([811, seed])
     frame = frame_of(load_rod_model("z-frame-z001"))
     world = some_scene(rng, frame, sd_px=0.1, least=7, tilt_rad=0.15, height=(0.25, 0.75))
