@@ -59,8 +59,6 @@ START_LOG_BETA = 0.15
 START_LEVEL = 0.3
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
 MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
-#: of the inverse of a fit's normal matrix, what its centre and its flatness need
-_WANTED = np.eye(N_PARAMETERS)[:, [0, 1, FLATNESS]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,13 +108,13 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
     long = LongSpots.of(blobs)
     if len(long):
-        rows = Rows(*long.coordinates(u, v), values, clipped, root_weights, long.mask)
+        along, across = long.coordinates(u, v)
+        rows = Rows(along, across, values, clipped, root_weights, long.mask)
     else:
         rows = Rows(u, v, values, clipped, root_weights)
     parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
 
-    inverse = np.linalg.solve(normal, np.broadcast_to(_WANTED, (k, N_PARAMETERS, 3)))
-    shift = inverse[:, :, CENTRE]
+    shift = np.linalg.solve(normal, np.broadcast_to(np.eye(N_PARAMETERS, 2), (k, N_PARAMETERS, 2)))
     influence = (shift.transpose(0, 2, 1) @ rows.by_spot[:, :-1] * root_weights[:, None]).transpose(1, 0, 2)
     influence = in_pixels(parameters, influence)
     centre = parameters[CENTRE]
@@ -129,7 +127,7 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     covariance *= (1.0 + (FAINT_SD * rough / blobs.height) ** 3)[:, None, None]
     covariance += _of_pixels(parameters, long.mask, n_clipped > 0, ceiling)[:, None, None] * np.eye(2)
     if len(long):
-        covariance[long.index] += long.pair_covariance(parameters, inverse[:, FLATNESS, -1])
+        covariance[long.index] += long.pair_covariance(parameters, rows.by_spot, normal)
     uv = centre.T
     away = ((uv - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
