@@ -10,6 +10,8 @@ from ctreg_cli.imaging.profile import CENTRE, FLATNESS, GRADIENT, LOG_HEIGHT, N_
 #: steps at most, and so many of them for all spots together. A spot is done when its centre moves by less than this
 #: (px), or the step by less than this (sd²): the next would be several times smaller
 MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
+#: of a long spot, how flat it is tells one rod from two: its ln γ moves by less than this in the last step
+DONE_FLATNESS = 0.05
 #: range of ln β and ln γ: from tails heavier than a Gaussian's to nearly a box
 FLATNESS_RANGE = (-0.5, 1.5)
 #: Levenberg–Marquardt damping; a step that is small only because of much damping does not end the fit
@@ -82,6 +84,8 @@ def _steps(
         trial = np.minimum(np.maximum(moved(parameters, step), low), high)
         change = trial[CENTRE] - parameters[CENTRE]
         small = np.maximum(np.abs(change[0]), np.abs(change[1])) < DONE_PX
+        if rows.long is not None:
+            small &= ~rows.long | (np.abs(trial[FLATNESS] - parameters[FLATNESS]) < DONE_FLATNESS)
         small |= np.einsum("ki,ik->k", gradient, step) < DONE_SD2
         small &= damping <= DONE_DAMPING
         if not stale and small.all():

@@ -132,7 +132,7 @@ class Rows:
         d_xi = np.multiply(steepness, slope, out=rows[0])
         d_eta = np.multiply(steepness, eta, out=rows[1])
         np.multiply(d_xi, xi, out=rows[6])
-        np.multiply(d_xi, eta, out=rows[7])
+        np.multiply(d_eta, xi, out=rows[7])
         np.multiply(d_eta, eta, out=rows[8])
         residuals = np.subtract(self._weighted_values, spot, out=rows[-1])
         residuals -= background * rows[BACKGROUND]
