@@ -194,6 +194,18 @@ def test_what_is_far_too_large_is_named_once(radius_px: int) -> None:
     assert np.hypot(rejected.u_px - 76, rejected.v_px - 80) < 4.0
 
 
+def test_a_bone_within_a_body_is_named_too() -> None:
+    """The body stands out of the air; the bone out of the body only, and has no peak of its own."""
+    row, column = np.mgrid[:160, :160]
+    values = np.where(np.hypot(row - 80, column - 76) < 70, 40.0, -1000.0)
+    values[np.hypot(row - 100, column - 80) < 12] = 900.0
+    values += render_rod((160, 160), (30.3, 60.2)) + np.random.default_rng(2).normal(0.0, 5.0, (160, 160))
+    spots = find_spots(as_slice(np.minimum(values, 3071)))
+    np.testing.assert_allclose(spots.uv_px[0], [30.3, 60.2], atol=0.05)
+    large = [np.hypot(r.u_px - 80, r.v_px - 100) for r in spots.rejected if r.reason == "too_large"]
+    assert min(large) < 12
+
+
 def test_the_best_spots_are_kept_when_there_are_too_many(image: np.ndarray) -> None:
     weak = image + render_rod(SHAPE, (60.0, 20.0), contrast=1500.0)
     spots = find_spots(as_slice(weak), SegmentationOptions(max_spots=3))

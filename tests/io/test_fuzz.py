@@ -139,6 +139,16 @@ def stands_in_the_file(raw: bytes, tag: int, expected: list[float], tolerance: f
     )
 
 
+def assert_geometry_stands_in(raw: bytes, one: Slice) -> None:
+    """What is said of scale and place is absent, or stands in the file."""
+    scale, T = one.info.scale, one.info.T_patient_slice
+    if scale is not None:
+        assert stands_in_the_file(raw, 0x00280030, [scale.s_y, scale.s_x])
+    if T is not None:
+        assert stands_in_the_file(raw, 0x00200032, T[:3, 3].tolist())
+        assert stands_in_the_file(raw, 0x00200037, T[:3, :2].T.ravel().tolist(), tolerance=5e-3)
+
+
 def test_damaged_explicit_files_never_give_a_geometry_that_is_not_in_them(tmp_path: Path) -> None:
     bases = [
         dicom_bytes(ct_slice(pixels(16, 20), InstanceNumber=7)),
@@ -156,12 +166,7 @@ def test_damaged_explicit_files_never_give_a_geometry_that_is_not_in_them(tmp_pa
                 if isinstance(one, UnreadableSlice):
                     continue
                 readable += 1
-                scale, T = one.info.scale, one.info.T_patient_slice
-                if scale is not None:
-                    assert stands_in_the_file(raw, 0x00280030, [scale.s_y, scale.s_x])
-                if T is not None:
-                    assert stands_in_the_file(raw, 0x00200032, T[:3, 3].tolist())
-                    assert stands_in_the_file(raw, 0x00200037, T[:3, :2].T.ravel().tolist(), tolerance=5e-3)
+                assert_geometry_stands_in(raw, one)
     assert N_EXPLICIT // 10 < readable < N_EXPLICIT  # the injuries neither all kill nor all miss
 
 
@@ -189,7 +194,10 @@ def test_damaged_files_of_other_kinds(tmp_path: Path, kind: str) -> None:
     rng = random.Random(kind)
     with bounded_memory():
         for _ in range(N_OTHERS if kind != "rle" else N_OTHERS // 3):
-            read(tmp_path / "f.dcm", mutate(raw, rng))
+            damaged = mutate(raw, rng)
+            for one in read(tmp_path / "f.dcm", damaged):
+                if kind in ("implicit", "bare", "rle") and isinstance(one, Slice):
+                    assert_geometry_stands_in(damaged, one)
 
 
 def test_damaged_png(tmp_path: Path) -> None:
