@@ -2,7 +2,8 @@
 
 The profile of :mod:`.profile` is fitted to all windows at once (:mod:`.fit`). Pixels are weighted by what can be wrong
 with them: noise everywhere, and structure of the background (streaks, plate edges) that grows with the distance from
-the blob. The covariance has the same two parts (:mod:`.uncertainty`), both measured in the window.
+the blob. The covariance has the same two parts (:mod:`.uncertainty`), both measured in the window; added to these is
+what a steep edge seen in few pixels costs, and of a long spot the chance that it is two rods (:mod:`.plateau`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ LEFT_OUT = 1e-12
 #: what pixels cost a perfect fit: an edge that falls by so much of the height in a pixel shifts the profile by this sd,
 #: px, a gentler one by this power of its slope less (measured without noise)
 STEEP, STEEP_SD_PX, STEEP_POWER = 0.8, 0.002, 5.5
-#: the same of a spot that is cut off, where its edge falls by so much of the ceiling in a pixel: its sides are all
+#: the same of a spot that is cut off, where its edge falls by so much of the ceiling in a pixel: of such a
+#: spot only the sides are seen
 CUT, CUT_SD_PX, CUT_POWER = 1.5, 0.0042, 1.2
 #: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
 #: variance is twice that of the linear law where it stands out by so many sd of the noise

@@ -141,9 +141,9 @@ def odd_variance(
 ) -> FloatArray:
     """Variance (k,) beyond noise of a field whose odd part about ``centre`` (2, k) is that of the residuals ``near``.
 
-    What noise may look like by chance hardly counts: up to three times its standard error nothing, all of what is far
-    beyond. A wrong shape of the profile leaves residuals that are
-    even about the centre and do not move it; only odd ones do.
+    What noise may look like by chance does not count: nothing up to three times its standard error, all of what is far
+    beyond. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; only odd
+    ones do.
     """
     k, side = len(residuals), 2 * (radius + _MARGIN) + 1
     u, v = (axis.ravel()[disc(radius)] for axis in grid(radius))
