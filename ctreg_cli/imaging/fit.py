@@ -10,6 +10,8 @@ from ctreg_cli.imaging.profile import CENTRE, FLATNESS, GRADIENT, LOG_HEIGHT, N_
 #: steps at most, and so many of them for all spots together. A spot is done when its centre moves by less than this
 #: (px), or the step by less than this (sd²): the next would be several times smaller
 MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
+#: what is left of a spot that is cut off goes to its minimum by smaller steps, px
+DONE_CUT_PX = 2e-3
 #: of a long spot, how flat it is tells one rod from two: its ln γ moves by less than this in the last step
 DONE_FLATNESS = 0.05
 #: range of ln β and ln γ: from tails heavier than a Gaussian's to nearly a box
@@ -60,6 +62,7 @@ def _steps(
     low[FLATNESS], high[FLATNESS] = FLATNESS_RANGE
     unit = np.ones_like(start)
     unit[7] = np.exp(-start[6])  # a step in l1 is measured in the spot's own coordinates, as all others are
+    done_px = np.where(rows.cut_off, DONE_CUT_PX, DONE_PX)
     prior = np.broadcast_to(PRIOR, start.shape)
     if rows.long is not None:
         prior = prior.copy()
@@ -83,7 +86,7 @@ def _steps(
             step[:, done] = 0.0
         trial = np.minimum(np.maximum(moved(parameters, step), low), high)
         change = trial[CENTRE] - parameters[CENTRE]
-        small = np.maximum(np.abs(change[0]), np.abs(change[1])) < DONE_PX
+        small = np.maximum(np.abs(change[0]), np.abs(change[1])) < done_px
         if rows.long is not None:
             small &= ~rows.long | (np.abs(trial[FLATNESS] - parameters[FLATNESS]) < DONE_FLATNESS)
         small |= np.einsum("ki,ik->k", gradient, step) < DONE_SD2
