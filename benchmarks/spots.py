@@ -108,11 +108,11 @@ def by_blobs(slice_: Slice, uv: np.ndarray) -> np.ndarray:
 
 
 def by_trackpy(slice_: Slice, uv: np.ndarray) -> np.ndarray:
-    """trackpy's locate, 7 px."""
+    """trackpy's locate, 9 px, with its own band-pass: the best of the settings tried (7, 9, 11 px; with and without)."""
     import trackpy
 
     values = np.maximum(slice_.values(), 0)
-    return trackpy.locate(values, 7, minmass=5000, preprocess=False)[["x", "y"]].to_numpy()
+    return trackpy.locate(values, 9, minmass=5000)[["x", "y"]].to_numpy()
 
 
 def score(method: Callable[[Slice, np.ndarray], np.ndarray], scenes: list[Scene]) -> str:
