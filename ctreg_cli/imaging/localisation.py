@@ -2,7 +2,8 @@
 
 The profile of :mod:`.profile` is fitted to all windows at once (:mod:`.fit`). Pixels are weighted by what can be wrong
 with them: noise everywhere, and structure of the background (streaks, plate edges) that grows with the distance from
-the blob. The covariance has the same two parts (:mod:`.uncertainty`), both measured in the window.
+the blob. The covariance has the same two parts (:mod:`.uncertainty`), both measured in the window; added to these is
+what a steep edge seen in few pixels costs, and of a long spot the chance that it is two rods (:mod:`.plateau`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,18 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import Blobs, inverse_elements
 from ctreg_cli.imaging.fit import fit
-from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, LOG_BETA, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, in_pixels
+from ctreg_cli.imaging.plateau import LongSpots, rod_flatness
+from ctreg_cli.imaging.profile import (
+    BACKGROUND,
+    CENTRE,
+    FLATNESS,
+    LOG_HEIGHT,
+    LONG_BETA,
+    N_PARAMETERS,
+    SHAPE,
+    Rows,
+    in_pixels,
+)
 from ctreg_cli.imaging.uncertainty import (
     KEPT,
     centre_covariance,
@@ -32,12 +44,15 @@ NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
 TOUCHING_PX = 2.0
 #: weight of what is left out of a fit, over that of the rest: not zero, so that its residuals can be looked at
 LEFT_OUT = 1e-12
-#: this many pixels at the image's ceiling inside one blob mean that it was cut off there
-MIN_CLIPPED_PX = 3
-#: what pixels cost a perfect fit: an edge sharper than a pixel shifts the profile by so much, px
-MODEL_SD_PX = 0.005
-#: and what a spot that is cut off costs beside: only its sides are fitted, two pixels wide where it is sharp
-CLIPPED_SD_PX = 0.008
+#: what pixels cost a perfect fit: an edge that falls by so much of the height in a pixel shifts the profile by this sd,
+#: px, a gentler one by this power of its slope less (measured without noise)
+STEEP, STEEP_SD_PX, STEEP_POWER = 0.8, 0.002, 5.5
+#: the same of a spot that is cut off, where its edge falls by so much of the ceiling in a pixel: of such a
+#: spot only the sides are seen
+CUT, CUT_SD_PX, CUT_POWER = 1.5, 0.0042, 1.2
+#: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
+#: variance is twice that of the linear law where it stands out by so many sd of the noise
+FAINT_SD = 5.0
 #: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
@@ -92,21 +107,29 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     spread += (noise * noise)[:, None]
     root_weights = np.sqrt(np.where(usable, 1.0, LEFT_OUT) / spread)
 
-    rows = Rows(u, v, values, clipped, root_weights)
-    parameters, normal = fit(
-        rows, _start(blobs, n_clipped, _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v))
-    )
+    brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
+    long = LongSpots.of(blobs)
+    if len(long):
+        along, across = long.coordinates(u, v)
+        rows = Rows(along, across, values, clipped, root_weights, long.mask)
+    else:
+        rows = Rows(u, v, values, clipped, root_weights)
+    parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
 
     shift = np.linalg.solve(normal, np.broadcast_to(np.eye(N_PARAMETERS, 2), (k, N_PARAMETERS, 2)))
     influence = (shift.transpose(0, 2, 1) @ rows.by_spot[:, :-1] * root_weights[:, None]).transpose(1, 0, 2)
+    influence = in_pixels(parameters, influence)
     centre = parameters[CENTRE]
+    if len(long):
+        centre, influence = long.turned_back(centre), long.turned_back(influence)
     residuals = rows.by_spot[:, -1] / root_weights
     rough, smooth, length = noise_field(residuals, usable & (distance > NOISE_BEYOND_PX), blobs.radius)
     structure = odd_variance(residuals, near, centre, blobs.radius, rough) / KEPT
-    covariance = centre_covariance(
-        in_pixels(parameters, influence), blobs.radius, smooth=(smooth, length), rough=rough, structure=structure
-    )
-    covariance += (MODEL_SD_PX**2 + CLIPPED_SD_PX**2 * (n_clipped > 0))[:, None, None] * np.eye(2)
+    covariance = centre_covariance(influence, blobs.radius, smooth=(smooth, length), rough=rough, structure=structure)
+    covariance *= (1.0 + (FAINT_SD * rough / blobs.height) ** 3)[:, None, None]
+    covariance += _of_pixels(parameters, long.mask, n_clipped > 0, ceiling)[:, None, None] * np.eye(2)
+    if len(long):
+        covariance[long.index] += long.pair_covariance(parameters, rows.by_spot, normal)
     uv = centre.T
     away = ((uv - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
@@ -121,10 +144,20 @@ def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolAr
     """Which pixels (k, p) are cut off, None if none is, and how many (k,) of each blob's own."""
     clipped = values >= ceiling
     n_clipped = np.count_nonzero(clipped & own, axis=1)
-    cut = n_clipped >= MIN_CLIPPED_PX
-    if not cut.any():
-        return None, np.zeros(len(values), dtype=np.intp)
-    return clipped & cut[:, None], np.where(cut, n_clipped, 0)
+    return (clipped if n_clipped.any() else None), n_clipped
+
+
+def _of_pixels(parameters: FloatArray, long: BoolArray, clipped: BoolArray, ceiling: float) -> FloatArray:
+    """Variance (k,) of the centre, px², because a steep edge is seen in few pixels, over which it is not averaged."""
+    width = np.exp(-np.maximum(parameters[SHAPE][0], parameters[SHAPE][2]))
+    beta = np.where(long, LONG_BETA, np.exp(parameters[FLATNESS]))
+    steepness = np.log(2.0) * beta / width
+    sd = STEEP_SD_PX * np.minimum(steepness / STEEP, 1.5) ** STEEP_POWER / np.sqrt(width)
+    # 2^(−q^β) is the ceiling over the height where q^β is this
+    at_ceiling = (parameters[LOG_HEIGHT] - np.log(np.maximum(ceiling - parameters[BACKGROUND], 1e-9))) / np.log(2.0)
+    steepness *= 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
+    cut_sd = CUT_SD_PX * np.minimum(steepness / CUT, 2.0) ** CUT_POWER
+    return np.asarray(np.where(clipped, np.maximum(sd, cut_sd), sd) ** 2)
 
 
 def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatArray:
@@ -155,7 +188,7 @@ def _brightest(blobs: Blobs, values: FloatArray, about: BoolArray, u: FloatArray
     return centre
 
 
-def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray) -> FloatArray:
+def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray, long: LongSpots) -> FloatArray:
     """First parameters (10, k) from the blob's moments, the number (k,) of its pixels cut off, and its ``centre``.
 
     Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the
@@ -163,14 +196,16 @@ def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray) -> FloatArray:
     """
     flat = np.minimum(n_clipped / blobs.area, MAX_FLAT_SHARE)
     log2_over = np.maximum(flat / (1.0 - flat), MIN_LOG2_OVER)
-    uu, uv, vv = inverse_elements(4.0 * (blobs.moments + START_BLUR_PX2 * np.eye(2)))
+    moments = long.turned_moments(blobs.moments) + START_BLUR_PX2 * np.eye(2)
+    uu, uv, vv = inverse_elements(4.0 * moments)
     wider = (1.0 + log2_over) ** np.exp(-START_LOG_BETA)
     l_vv = np.sqrt(vv * wider)
     l_uv = uv * wider / l_vv
     start = np.zeros((N_PARAMETERS, len(blobs)))
-    start[CENTRE] = centre
+    start[CENTRE] = long.turned(centre)
     start[LOG_HEIGHT] = log2_over * np.log(2.0) + np.log(blobs.height)
     start[BACKGROUND] = blobs.background
     start[SHAPE] = 0.5 * np.log(uu * wider - l_uv * l_uv), l_uv, np.log(l_vv)
-    start[LOG_BETA] = START_LOG_BETA
+    start[FLATNESS] = START_LOG_BETA
+    start[FLATNESS, long.index] = rod_flatness(np.sqrt(moments[:, 0, 0] / moments[:, 1, 1])[long.index])
     return start

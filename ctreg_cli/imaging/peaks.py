@@ -61,8 +61,13 @@ def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_h
     """Contrast and half width of peaks ``pixels`` (k, 2) of smoothed values ``heights`` (k,), from rings about them.
 
     On each ring the 75th percentile counts: a plate, a streak or a long spot crosses a smaller part of it, while an
-    edge or the inside of something large fills it. The background is the darkest ring.
+    edge or the inside of something large fills it. The background is the darkest ring. Peaks that are cut off lie on
+    the edge of their flat tops, and are moved to the middle first.
     """
+    flat = np.flatnonzero(heights >= image.ceiling)
+    if len(flat):
+        pixels = pixels.copy()
+        pixels[flat] = _middles_of_tops(image, pixels[flat], int(np.ceil(2.0 * max_half_width)))
     steps = np.arange(np.ceil(np.log(max_half_width + 3.0) / np.log(RING_RATIO)) + 1)
     radii = np.unique(np.rint(RING_RATIO**steps))
     angles = 2 * np.pi * np.arange(RING_SAMPLES) / RING_SAMPLES
@@ -75,6 +80,20 @@ def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_h
     fallen = rings < (heights - 0.5 * contrast)[:, None]
     half_width = np.where(fallen.any(axis=1), radii[fallen.argmax(axis=1)], np.inf)
     return Peaks(pixels=pixels, contrast=contrast, half_width=half_width)
+
+
+def _middles_of_tops(image: UprightImage, pixels: IntArray, reach: int) -> IntArray:
+    """Pixels (k, 2) in the middle of flat tops, whose first ones in reading order are given; ``reach`` px at most."""
+    ahead = np.arange(1, reach + 1)
+
+    def run(du: int, dv: int) -> IntArray:
+        top = image.at(rows[:, None] + dv * ahead, columns[:, None] + du * ahead) >= image.ceiling
+        return np.asarray(np.where(top.all(axis=1), reach, top.argmin(axis=1)))
+
+    columns, rows = pixels.T
+    rows = rows + run(0, 1) // 2
+    columns = columns + (run(1, 0) - run(-1, 0)) // 2
+    return np.stack([columns, rows], axis=1)
 
 
 def large_regions(smooth: NDArray[Any], level: float, least_px: float) -> FloatArray:

@@ -4,6 +4,9 @@
 a Gaussian (a rod thinner than the blur), larger β the flatter top of a thick rod or of a tilted one in a thick slab.
 The profile is even about its centre, so that no error in its shape can move the centre.
 
+A tilted rod in a thick slab leaves a plateau with blurred ends, which no such ellipse resembles. Of long spots, seen
+along their own axes, ``q = |ξ|^2γ + |η|²`` instead, β fixed: γ = 1 is the ellipse, larger γ the longer plateau.
+
 Parameters are (10, k), a row each. Steps of a fit are taken in the spot's own coordinates, where the derivatives are
 products of ξ and η and all spots look alike: see :func:`moved`.
 """
@@ -16,18 +19,20 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 
-#: order of the parameters: centre u, v; ln a; b; g_u, g_v; L = [[e^l0, 0], [l1, e^l2]]; ln β
+#: order of the parameters: centre u, v; ln a; b; g_u, g_v; L = [[e^l0, 0], [l1, e^l2]]; ln β, or ln γ of a long spot
 CENTRE: Final = slice(0, 2)
 LOG_HEIGHT: Final = 2
 BACKGROUND: Final = 3
 GRADIENT: Final = slice(4, 6)
 SHAPE: Final = slice(6, 9)
-LOG_BETA: Final = 9
+FLATNESS: Final = 9
 N_PARAMETERS: Final = 10
 
 _LN2 = float(np.log(2.0))
 #: keeps ln q finite at the very centre; (px/px)²
 _TINY = 1e-9
+#: β of long spots: that of a thin rod, blurred
+LONG_BETA = 1.08
 
 
 def moved(parameters: FloatArray, step: FloatArray) -> FloatArray:
@@ -61,23 +66,37 @@ class Rows:
     """
 
     def __init__(
-        self, u: FloatArray, v: FloatArray, values: FloatArray, clipped: BoolArray | None, root_weights: FloatArray
+        self,
+        u: FloatArray,
+        v: FloatArray,
+        values: FloatArray,
+        clipped: BoolArray | None,
+        root_weights: FloatArray,
+        long: BoolArray | None = None,
     ) -> None:
-        """Take pixel coordinates ``u``, ``v`` (p,), ``values``, whether they are ``clipped``, and roots of weights.
+        """Take pixel coordinates ``u``, ``v``, ``values``, whether they are ``clipped``, and roots of weights.
 
-        The last three are (k, p); ``clipped`` is None where nothing is.
+        The last three are (k, p); ``clipped`` is None where nothing is. Coordinates are (p,), or where some of the
+        spots (k,) are ``long`` (k, p), of those turned so that u runs along the spot.
         """
         self._u, self._v, self._values, self._clipped, self.root_weights = u, v, values, clipped, root_weights
+        self.long = long
+        #: (k,) whether pixels of a spot are clipped
+        self.cut_off = np.zeros(len(values), dtype=bool) if clipped is None else clipped.any(axis=1)
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
         self._rows[3], self._rows[4], self._rows[5] = root_weights, root_weights * u, root_weights * v
+        self._background = self._rows[3:6].copy() if clipped is not None else None
         #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
         self.by_spot = self._rows.transpose(1, 0, 2)
 
     def take(self, which: IntArray) -> Rows:
         """Some of the spots."""
         clipped = None if self._clipped is None else self._clipped[which]
-        return Rows(self._u, self._v, self._values[which], clipped, self.root_weights[which])
+        turned = self._u.ndim > 1
+        u, v = (self._u[which], self._v[which]) if turned else (self._u, self._v)
+        long = None if self.long is None else self.long[which]
+        return Rows(u, v, self._values[which], clipped, self.root_weights[which], long)
 
     def evaluate(self, parameters: FloatArray) -> FloatArray:
         """Fill :attr:`by_spot` for ``parameters`` (10, k); products of its rows (k, 11, 11), summed over the pixels.
@@ -86,27 +105,39 @@ class Rows:
         pixel says only "at least this bright": where the profile is brighter still, it takes no part.
         """
         rows = self._rows
-        centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, log_beta = parameters[:, :, None]
+        if self._background is not None:  # some were set to zero below
+            rows[3:6] = self._background
+        centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, flatness = parameters[:, :, None]
         x = self._u - centre_u
         xi = np.exp(l0) * x
         eta = np.exp(l2) * (self._v - centre_v)
         eta += l1 * x
         q = xi * xi
+        beta = np.exp(flatness)
+        slope = xi  # half of ∂q/∂ξ
+        if self.long is not None:
+            at = np.flatnonzero(self.long)
+            square, gamma = q[at] + _TINY, beta[at]
+            log_along = np.log(square)
+            along = np.exp(gamma * log_along)
+            slope, q[at], beta[at] = xi.copy(), along, LONG_BETA
+            slope[at] *= gamma * along / square
         q += eta * eta
         q += _TINY
         log_q = np.log(q)
-        beta = np.exp(log_beta)
         steepness = np.exp(beta * log_q)
         spot = np.exp(log_height - _LN2 * steepness, out=rows[LOG_HEIGHT])
         spot *= self.root_weights
         steepness *= spot
         steepness *= -2.0 * _LN2 * beta
-        np.multiply(0.5 * steepness, log_q, out=rows[LOG_BETA])
+        np.multiply(0.5 * steepness, log_q, out=rows[FLATNESS])
         steepness /= q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
-        d_xi = np.multiply(steepness, xi, out=rows[0])
+        if self.long is not None:
+            rows[FLATNESS, at] = 0.5 * steepness[at] * gamma * along * log_along
+        d_xi = np.multiply(steepness, slope, out=rows[0])
         d_eta = np.multiply(steepness, eta, out=rows[1])
         np.multiply(d_xi, xi, out=rows[6])
-        np.multiply(d_xi, eta, out=rows[7])
+        np.multiply(d_eta, xi, out=rows[7])
         np.multiply(d_eta, eta, out=rows[8])
         residuals = np.subtract(self._weighted_values, spot, out=rows[-1])
         residuals -= background * rows[BACKGROUND]
@@ -114,6 +145,5 @@ class Rows:
         residuals -= g_v * rows[5]
         self.by_spot = rows.transpose(1, 0, 2)
         if self._clipped is not None:
-            satisfied = self._clipped & (residuals <= 0)
-            self.by_spot = np.where(satisfied[:, None], 0.0, self.by_spot)
+            rows[:, self._clipped & (residuals <= 0)] = 0.0
         return np.asarray(self.by_spot @ self.by_spot.transpose(0, 2, 1))

@@ -67,8 +67,9 @@ FIRST_LOOK = 0.5
 SMOOTHING_LOSS = 0.5
 #: so many peaks are measured for one spot asked for: bounds the time on images of noise
 PEAKS_PER_SPOT = 6
-#: things are bright that lie above this share of the range between the image's median and its brightest
-LARGE_SHARE = 0.25
+#: things are bright that lie above one of these shares of the range between the image's median and its brightest: in a
+#: body that does so itself, its bones do
+LARGE_SHARES = (0.25, 0.45)
 #: at most so many rejected candidates are reported
 MAX_REJECTED = 100
 
@@ -137,12 +138,14 @@ def _with_large_regions(spots: Spots, image: UprightImage, smooth: NDArray[Any],
     if not sample.size:
         return spots
     common = float(np.median(sample))
-    boxes = large_regions(smooth, common + LARGE_SHARE * (image.ceiling - common), limits.width_px)
+    levels = common + np.array(LARGE_SHARES) * (image.ceiling - common)
+    boxes = np.vstack([large_regions(smooth, level, limits.width_px) for level in levels[::-1]])
     seen = np.vstack([spots.uv_px, *([[r.u_px, r.v_px]] for r in spots.rejected)])
     inside = np.all((seen >= boxes[:, None, :2]) & (seen <= boxes[:, None, 2:]), axis=2)
     unseen = boxes[~np.any(inside, axis=1)]
     rejections = _Rejections()
-    rejections.add(0.5 * (unseen[:, :2] + unseen[:, 2:]), "too_large")
+    middles = np.unique(0.5 * (unseen[:, :2] + unseen[:, 2:]), axis=0)
+    rejections.add(middles, "too_large")
     return replace(spots, rejected=(*rejections.spots, *spots.rejected))
 
 

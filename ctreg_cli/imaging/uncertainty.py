@@ -19,6 +19,8 @@ from ctreg_cli.imaging.window import disc, grid, nan_quantile, ring
 STRUCTURE_LENGTH_PX = 2.0
 #: share of the odd part of such structure about a spot that its fit leaves in the residuals (0.5 … 0.75 were computed)
 KEPT = 0.65
+#: in standard errors, what noise about a spot may look like by chance
+SURE_OF_STRUCTURE = 3.0
 #: sd of a normal distribution over its median absolute deviation
 MAD_TO_SD = 1.4826
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
@@ -139,8 +141,9 @@ def odd_variance(
 ) -> FloatArray:
     """Variance (k,) beyond noise of a field whose odd part about ``centre`` (2, k) is that of the residuals ``near``.
 
-    Only what exceeds noise by its own standard error counts. A wrong shape of the profile leaves residuals that are
-    even about the centre and do not move it; only odd ones do.
+    What noise may look like by chance does not count: nothing up to three times its standard error, all of what is far
+    beyond. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; only odd
+    ones do.
     """
     k, side = len(residuals), 2 * (radius + _MARGIN) + 1
     u, v = (axis.ravel()[disc(radius)] for axis in grid(radius))
@@ -154,7 +157,9 @@ def odd_variance(
     paired = ~np.isnan(odd)
     pairs = np.maximum(0.5 * np.count_nonzero(paired, axis=1), 1.0)
     variance = 0.25 * np.where(paired, odd * odd, 0.0).sum(axis=1) / pairs
-    return np.asarray(np.maximum(variance - noise**2 * (1.0 + np.sqrt(2.0 / pairs)), 0.0))
+    excess = variance / noise**2 - 1.0
+    chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
+    return np.asarray(noise**2 * excess * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
 
 
 def centre_covariance(

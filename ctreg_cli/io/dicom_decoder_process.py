@@ -1,8 +1,8 @@
 """The process in which compressed pixels are decoded: ``python -P -m ctreg_cli.io.dicom_decoder_process``.
 
 Reads requests from standard input until it is closed: a line of JSON (see :mod:`ctreg_cli.io.dicom_decoding`), then
-``n_bytes`` of codestream. Answers on standard output: a line with the number of bytes, then the stored values in this
-machine's byte order; 0 bytes where the codestream cannot be decoded.
+``n_bytes`` of codestream. Answers on standard output: an empty line when it is ready; then for each request a line with
+the number of bytes, and the stored values in this machine's byte order; 0 bytes where the codestream cannot be decoded.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import warnings
+from importlib import import_module
 from typing import Any, BinaryIO
 
 #: address space of this process; a decoder that wants more is being fooled
@@ -25,6 +26,10 @@ def main() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # decoders print; their chatter must not get among the answers
     _limit_memory()
     warnings.simplefilter("ignore")
+    import_module("pydicom.pixels.decoders")  # the slow part of the first answer
+
+    answers.write(b"\n")
+    answers.flush()
     serve(sys.stdin.buffer, answers)
 
 

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from ctreg_cli.errors import UnreadableSliceError
 
-#: a slice takes 5 to 50 ms; some decoders spin for half a minute over a damaged one
-TIMEOUT_S = 15.0
+#: a slice of 512 × 512 takes 5 to 50 ms; some decoders spin for half a minute over a damaged one of any size. The first
+#: answer also waits for the process to start
+TIMEOUT_S, TIMEOUT_S_PER_MEGAPIXEL, START_S = 2.0, 4.0, 30.0
 _UNDECODABLE = "cannot be decoded: damaged, or of a kind unknown to the decoders"
 
 
@@ -54,7 +55,8 @@ def decode(codestream: bytes, *, transfer_syntax: str, dtype: np.dtype[Any], **l
         "pixel_keyword": "PixelData",
         **layout,
     }
-    values = _process_of(os.getpid()).ask(options, codestream)
+    timeout_s = TIMEOUT_S + TIMEOUT_S_PER_MEGAPIXEL * 1e-6 * layout["rows"] * layout["columns"]
+    values = _process_of(os.getpid()).ask(options, codestream, timeout_s)
     if len(values) != layout["rows"] * layout["columns"] * dtype.itemsize:
         raise UnreadableSliceError(_UNDECODABLE)
     return np.frombuffer(values, dtype).reshape(layout["rows"], layout["columns"])
@@ -68,14 +70,14 @@ class _DecoderProcess:
         self._process: subprocess.Popen[bytes] | None = None
         atexit.register(self.stop)
 
-    def ask(self, options: dict[str, object], codestream: bytes) -> bytes:
+    def ask(self, options: dict[str, object], codestream: bytes, timeout_s: float) -> bytes:
         """The decoded bytes; none if the process failed, died or took too long."""
         with self._lock:
             try:
                 process = self._process or self._start()
             except OSError as error:
                 raise UnreadableSliceError(f"the decoder cannot be started ({error.strerror})") from None
-            watchdog = threading.Timer(TIMEOUT_S, process.kill)
+            watchdog = threading.Timer(timeout_s, process.kill)
             watchdog.start()
             try:
                 values = _exchange(process, json.dumps({**options, "n_bytes": len(codestream)}).encode(), codestream)
@@ -97,6 +99,13 @@ class _DecoderProcess:
             stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
+        watchdog = threading.Timer(START_S, self._process.kill)
+        watchdog.start()
+        try:
+            assert self._process.stdout is not None
+            self._process.stdout.readline()  # it is ready; of a dead one the first question finds out
+        finally:
+            watchdog.cancel()
         return self._process
 
     def stop(self) -> None:

@@ -80,9 +80,11 @@ def draw_overlay(
     crops = _crops(slice_, spots, labels, predicted)
     width = MARGIN + len(crops) * (PANEL + MARGIN)
     canvas = Image.new("RGB", (width, PANEL + 2 * LINE + 2 * MARGIN), GROUND)
-    for i, crop in enumerate(crops):
-        panel, view = _view(grey, crop)
-        _draw_marks(panel, view, marks, with_text=i == len(crops) - 1)
+    views = [_view(grey, crop) for crop in crops]  # what the close-up shows is named there, all else in the whole slice
+    closest = views[-1][1]
+    for i, (panel, view) in enumerate(views):
+        named = marks if view is closest else [mark for mark in marks if not closest.shows(mark.uv)]
+        _draw_marks(panel, view, marks, named)
         canvas.paste(panel, (MARGIN + i * (PANEL + MARGIN), LINE + MARGIN))
     draw, font = ImageDraw.Draw(canvas), _font(FONT_SIZE)
     draw.text((MARGIN, MARGIN // 2 + 2), title, fill=TEXT, font=font)
@@ -113,6 +115,10 @@ class _View:
 
     def __call__(self, uv: FloatArray) -> tuple[float, float]:
         return (float(uv[0] - self.u0) * self.zoom, float(uv[1] - self.v0) * self.zoom)
+
+    def shows(self, uv: FloatArray) -> bool:
+        """Whether a place of the image, px, lies in the panel."""
+        return all(0 <= c < PANEL for c in self(uv))
 
 
 def _spot_marks(spots: Spots, labels: Mapping[int, str]) -> list[_Mark]:
@@ -171,9 +177,10 @@ def _view(grey: Image.Image, crop: Box) -> tuple[Image.Image, _View]:
     return panel, _View(u0=left - corner[0] / zoom, v0=top - corner[1] / zoom, zoom=zoom)
 
 
-def _draw_marks(panel: Image.Image, view: _View, marks: Sequence[_Mark], *, with_text: bool) -> None:
+def _draw_marks(panel: Image.Image, view: _View, marks: Sequence[_Mark], named: Sequence[_Mark]) -> None:
+    """Draw all ``marks``, and write what the ``named`` of them are."""
     draw = ImageDraw.Draw(panel)
-    inside = [m for m in marks if all(0 <= c < PANEL for c in view(m.uv))]
+    inside = [m for m in marks if view.shows(m.uv)]
     rings = [_ring(m, view) for m in inside]
     for mark, ring in zip(inside, rings, strict=True):
         x, y = view(mark.uv)
@@ -185,8 +192,7 @@ def _draw_marks(panel: Image.Image, view: _View, marks: Sequence[_Mark], *, with
             draw.ellipse([x - 3, y - 3, x + 3, y + 3], outline=mark.colour)
         else:
             draw.line([*ring, ring[0]], fill=mark.colour, width=2)
-    if with_text:
-        _draw_texts(draw, view, inside, [_bounds(ring) for ring in rings])
+    _draw_texts(draw, view, inside, [_bounds(ring) for ring in rings], named)
 
 
 def _ring(mark: _Mark, view: _View) -> list[tuple[float, float]]:
@@ -200,9 +206,12 @@ def _ring(mark: _Mark, view: _View) -> list[tuple[float, float]]:
     return list(zip(xs.tolist(), ys.tolist(), strict=True))
 
 
-def _draw_texts(draw: ImageDraw.ImageDraw, view: _View, marks: Sequence[_Mark], taken: Sequence[Box]) -> None:
-    """Write each mark's text at the nearest free place, outwards from the middle of all marks first."""
+def _draw_texts(
+    draw: ImageDraw.ImageDraw, view: _View, marks: Sequence[_Mark], taken: Sequence[Box], wanted: Sequence[_Mark]
+) -> None:
+    """Write each wanted mark's text at the nearest free place, outwards from the middle of all marks first."""
     occupied = list(taken)
+    wanted_ids = {id(mark) for mark in wanted}
     named: list[tuple[str, float, float]] = []
     middle = np.mean([view(m.uv) for m in marks], axis=0) if marks else np.zeros(2)
     for mark, ring in zip(marks, taken, strict=True):
@@ -210,7 +219,7 @@ def _draw_texts(draw: ImageDraw.ImageDraw, view: _View, marks: Sequence[_Mark], 
         again = mark.small and any(
             t == mark.text and np.hypot(x - px, y - py) < SAME_REASON_APART for t, px, py in named
         )
-        if not mark.text or again:
+        if not mark.text or again or id(mark) not in wanted_ids:
             continue
         named.append((mark.text, x, y))
         font = _font(FONT_SIZE - 4 if mark.small else FONT_SIZE)

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from ctreg_cli.imaging.segmentation import find_spots
 from ctreg_cli.imaging.spots import Spots
-from tests.imaging.rendering import as_slice, cramer_rao, render_grid, render_rod
+from tests.imaging.rendering import as_slice, attainable, cramer_rao, render_grid, render_rod
 
 SIDE, PITCH = 7, 34
 
@@ -21,6 +21,13 @@ CASES = {
     "thick rod": ({"diameter_mm": 2.0, "mm_per_px": 0.33, "blur_mm": 0.35, "contrast": 2500.0}, 100.0, np.inf),
     "clipped": ({"contrast": 11000.0, "slope": (0.3, 0.1)}, 150.0, 3071.0),
     "30° in 5 mm": ({"thickness_mm": 5.0, "slope": (0.5, 0.3), "contrast": 9000.0}, 100.0, np.inf),
+    "45° in 5 mm": ({"thickness_mm": 5.0, "slope": (0.8, 0.6), "contrast": 9000.0}, 60.0, np.inf),
+    "45°, clipped": ({"thickness_mm": 5.0, "slope": (0.8, 0.6), "contrast": 15000.0}, 60.0, 3071.0),
+    "7 noise sd": ({"contrast": 1500.0, "blur_mm": 0.45}, 100.0, np.inf),
+    "200 noise sd": ({"contrast": 3000.0, "blur_mm": 0.45}, 7.0, np.inf),
+    "sharp": ({"contrast": 3000.0, "blur_mm": 0.2}, 80.0, np.inf),
+    "sharp, clipped": ({"contrast": 8000.0, "slope": (0.3, 0.1), "blur_mm": 0.2}, 60.0, 3071.0),
+    "rather sharp, clipped": ({"contrast": 8000.0, "slope": (0.3, 0.1), "blur_mm": 0.35}, 60.0, 3071.0),
     "small pixels, dark floor": ({"contrast": 400.0}, 15.0, np.inf),
 }
 
@@ -46,20 +53,32 @@ def errors(spots: Spots, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_centres_reach_the_cramer_rao_bound_and_covariances_are_true(case: str) -> None:
+    """The bound is that of a rod of which nothing is known; of all but the sharp ones it is that of a known one."""
     rod, noise, ceiling = CASES[case]
     image, uv = rendered(case)
     rng = np.random.default_rng(1)
     parts = [errors(scanned(image, noise, ceiling, rng, rod), uv) for _ in range(4)]
     error, covariance = (np.concatenate(p) for p in zip(*parts, strict=True))
-    assert len(error) == 4 * 40  # max_spots of SIDE² = 49
-    bound = np.sqrt(np.trace(cramer_rao(noise, ceiling, **rod)))
-    assert np.sqrt((error**2).sum(axis=1).mean()) < 1.15 * bound
+    assert len(error) >= (4 * 40 if case != "7 noise sd" else 120)  # max_spots of SIDE² = 49
+    at_best = cramer_rao(noise, ceiling, **rod) if "sharp" not in case else attainable(noise, ceiling, uv[:12], **rod)
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 1.15 * np.sqrt(np.trace(at_best))
     chi2 = np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error).mean() / 2
-    assert 0.7 < chi2 < 1.25
+    assert 0.8 < chi2 < 1.2
 
 
 @pytest.mark.parametrize(
-    ("case", "most_px"), [("thin rod", 0.01), ("thick rod", 0.01), ("30° in 5 mm", 0.01), ("clipped", 0.03)]
+    ("case", "most_px"),
+    [
+        ("thin rod", 0.01),
+        ("thick rod", 0.01),
+        ("sharp", 0.01),
+        ("30° in 5 mm", 0.01),
+        ("45° in 5 mm", 0.01),
+        ("clipped", 0.03),
+        ("45°, clipped", 0.03),
+        ("sharp, clipped", 0.03),
+        ("rather sharp, clipped", 0.03),
+    ],
 )
 def test_where_in_its_pixel_a_rod_lies_does_not_move_the_centre(case: str, most_px: float) -> None:
     rod, _, ceiling = CASES[case]
@@ -93,6 +112,44 @@ def test_a_neighbour_four_pixels_away_is_another_spot_and_widens_both(ceiling: f
         assert np.sqrt(((error**2) / np.diagonal(covariance, axis1=1, axis2=2)).max()) < 3.0
         single = find_spots(as_slice(np.minimum(alone + noise, ceiling)))
         assert (np.trace(covariance, axis1=1, axis2=2) > 4 * np.trace(single.covariance_px[0])).all()
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.7])
+@pytest.mark.parametrize("distance_px", [3.0, 3.4])
+def test_two_rods_that_run_into_one_spot_are_not_taken_for_a_sure_one(distance_px: float, ratio: float) -> None:
+    rng = np.random.default_rng(8)
+    for angle in rng.uniform(0, np.pi, 8):
+        middle = np.array([35.0, 35.0]) + rng.uniform(-0.5, 0.5, 2)
+        half = 0.5 * distance_px * np.array([np.cos(angle), np.sin(angle)])
+        rods = np.stack([middle - half, middle + half])
+        image = render_rod((71, 71), tuple(rods[0])) + ratio * render_rod((71, 71), tuple(rods[1]))
+        spots = find_spots(as_slice(image + rng.normal(0.0, image.max() / 50, image.shape)))
+        assert len(spots) in (1, 2)
+        for uv, covariance in zip(spots.uv_px, spots.covariance_px, strict=True):
+            error = rods - uv
+            own = np.einsum("ki,ij,kj->k", error, np.linalg.inv(covariance), error) / 2
+            of_one = np.linalg.norm(error, axis=1).min() < 0.35 * distance_px
+            assert (own.min() if of_one else own.max()) < 3.0**2  # in the middle it may be taken for either
+
+
+@pytest.mark.parametrize("tilt", [0.6, 1.0, 1.4])
+def test_a_tilted_rod_in_a_thick_slab_is_not_taken_for_two(tilt: float) -> None:
+    rod = {"thickness_mm": 5.0, "slope": (0.8 * tilt, 0.6 * tilt), "contrast": 9000.0}
+    image, uv = render_grid(np.random.default_rng(9), SIDE, PITCH, **rod)
+    _, covariance = errors(scanned(image, image.max() / 50, np.inf, np.random.default_rng(10), rod), uv)
+    bound = cramer_rao(image.max() / 50, **rod)
+    assert np.percentile(np.trace(covariance, axis1=1, axis2=2), 90) < 2.0 * np.trace(bound)
+
+
+@pytest.mark.parametrize("n_cut", [1, 2])
+def test_a_spot_with_one_pixel_cut_off_is_fitted_without_it(n_cut: int) -> None:
+    """The few brightest pixels lowered to the ceiling say that they were at least so bright, and nothing more."""
+    image, uv = render_grid(np.random.default_rng(11), 2, PITCH, contrast=3000.0, blur_mm=0.3)
+    whole = image + np.random.default_rng(12).normal(0.0, 3.0, image.shape)
+    cut = np.minimum(whole, np.sort(whole.ravel())[-n_cut] - 400.0)
+    error, _ = errors(find_spots(as_slice(cut)), uv)
+    assert len(error) == 4
+    assert np.abs(error).max() < 0.03
 
 
 def test_a_streak_through_a_spot_widens_it() -> None:

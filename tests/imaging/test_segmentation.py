@@ -16,7 +16,7 @@ from ctreg_cli.imaging.slice import Slice, SliceInfo
 from ctreg_cli.pipeline import expecting
 from ctreg_cli.rods import Rod, RodModel
 from ctreg_cli.scale import Scale
-from tests.imaging.rendering import as_slice, render_rod
+from tests.imaging.rendering import as_slice, render_grid, render_rod
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"
 SHAPE = (128, 160)
@@ -192,6 +192,29 @@ def test_what_is_far_too_large_is_named_once(radius_px: int) -> None:
     (rejected,) = spots.rejected
     assert rejected.reason == "too_large"
     assert np.hypot(rejected.u_px - 76, rejected.v_px - 80) < 4.0
+
+
+@pytest.mark.parametrize(("diameter_mm", "mm_per_px"), [(3.0, 0.3), (4.0, 0.5), (4.0, 0.35), (5.0, 0.8)])
+def test_thick_rods_with_flat_tops_are_all_found_and_well(diameter_mm: float, mm_per_px: float) -> None:
+    """No diameter is given; the first pixel of a flat top lies a radius from its middle."""
+    rod = {"slope": (0.3, 0.1), "blur_mm": 0.3, "diameter_mm": diameter_mm, "mm_per_px": mm_per_px}
+    image, uv = render_grid(np.random.default_rng(4), 5, int(34 + 8 / mm_per_px), contrast=8000.0, **rod)
+    noise = np.random.default_rng(5).normal(0.0, 10.0, image.shape)
+    spots = find_spots(as_slice(np.minimum(image + noise, 3071), mm_per_px=mm_per_px))
+    distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).min(axis=0)
+    assert distance.max() < 0.03
+
+
+def test_a_bone_within_a_body_is_named_too() -> None:
+    """The body stands out of the air; the bone out of the body only, and has no peak of its own."""
+    row, column = np.mgrid[:160, :160]
+    values = np.where(np.hypot(row - 80, column - 76) < 70, 40.0, -1000.0)
+    values[np.hypot(row - 100, column - 80) < 12] = 900.0
+    values += render_rod((160, 160), (30.3, 60.2)) + np.random.default_rng(2).normal(0.0, 5.0, (160, 160))
+    spots = find_spots(as_slice(np.minimum(values, 3071)))
+    np.testing.assert_allclose(spots.uv_px[0], [30.3, 60.2], atol=0.05)
+    large = [np.hypot(r.u_px - 80, r.v_px - 100) for r in spots.rejected if r.reason == "too_large"]
+    assert min(large) < 12
 
 
 def test_the_best_spots_are_kept_when_there_are_too_many(image: np.ndarray) -> None:

@@ -6,10 +6,13 @@ file must be absent, or stand in the file for that parser too.
 
 from __future__ import annotations
 
+import base64
 import random
 import resource
 import signal
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +23,23 @@ import pytest
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian, RLELossless
 
 from ctreg_cli.imaging.slice import Slice, UnreadableSlice
+from ctreg_cli.io import dicom_decoding
 from ctreg_cli.io.dicom import NotAnImage, read_dicom
+from ctreg_cli.io.dicom_decoding import codec_available
 from ctreg_cli.io.png import read_png
-from tests.io.dicom_samples import ct_slice, dicom_bytes, enhanced_ct, item, pixels, swap_to_big_endian, write_dicom
+from tests.io.dicom_samples import (
+    CODESTREAMS,
+    compressed_slice,
+    ct_slice,
+    dicom_bytes,
+    enhanced_ct,
+    item,
+    pixels,
+    swap_to_big_endian,
+    write_dicom,
+)
 
-N_EXPLICIT, N_OTHERS, N_PNG = 2400, 300, 300
+N_EXPLICIT, N_OTHERS, N_PNG, N_CODESTREAMS = 2400, 300, 300, 30
 HANG_S = 2.0
 MAX_GROWTH_BYTES = 100 * 2**20
 
@@ -139,6 +154,16 @@ def stands_in_the_file(raw: bytes, tag: int, expected: list[float], tolerance: f
     )
 
 
+def assert_geometry_stands_in(raw: bytes, one: Slice) -> None:
+    """What is said of scale and place is absent, or stands in the file."""
+    scale, T = one.info.scale, one.info.T_patient_slice
+    if scale is not None:
+        assert stands_in_the_file(raw, 0x00280030, [scale.s_y, scale.s_x])
+    if T is not None:
+        assert stands_in_the_file(raw, 0x00200032, T[:3, 3].tolist())
+        assert stands_in_the_file(raw, 0x00200037, T[:3, :2].T.ravel().tolist(), tolerance=5e-3)
+
+
 def test_damaged_explicit_files_never_give_a_geometry_that_is_not_in_them(tmp_path: Path) -> None:
     bases = [
         dicom_bytes(ct_slice(pixels(16, 20), InstanceNumber=7)),
@@ -156,12 +181,7 @@ def test_damaged_explicit_files_never_give_a_geometry_that_is_not_in_them(tmp_pa
                 if isinstance(one, UnreadableSlice):
                     continue
                 readable += 1
-                scale, T = one.info.scale, one.info.T_patient_slice
-                if scale is not None:
-                    assert stands_in_the_file(raw, 0x00280030, [scale.s_y, scale.s_x])
-                if T is not None:
-                    assert stands_in_the_file(raw, 0x00200032, T[:3, 3].tolist())
-                    assert stands_in_the_file(raw, 0x00200037, T[:3, :2].T.ravel().tolist(), tolerance=5e-3)
+                assert_geometry_stands_in(raw, one)
     assert N_EXPLICIT // 10 < readable < N_EXPLICIT  # the injuries neither all kill nor all miss
 
 
@@ -189,7 +209,49 @@ def test_damaged_files_of_other_kinds(tmp_path: Path, kind: str) -> None:
     rng = random.Random(kind)
     with bounded_memory():
         for _ in range(N_OTHERS if kind != "rle" else N_OTHERS // 3):
-            read(tmp_path / "f.dcm", mutate(raw, rng))
+            damaged = mutate(raw, rng)
+            for one in read(tmp_path / "f.dcm", damaged):
+                if kind in ("implicit", "bare", "rle") and isinstance(one, Slice):
+                    assert_geometry_stands_in(damaged, one)
+
+
+@pytest.mark.parametrize("syntax", CODESTREAMS)
+def test_damaged_codestreams(tmp_path: Path, syntax: str) -> None:
+    """Decoded in another process, which may die or spin: then it is ended, and the next slice has a new one."""
+    if not codec_available(syntax):
+        pytest.skip("the codecs extra is not installed")
+    rng, good = random.Random(syntax), base64.b85decode(CODESTREAMS[syntax])
+    whole = dicom_bytes(compressed_slice(syntax), syntax)
+    with bounded_memory():
+        for k in range(N_CODESTREAMS):
+            raw = mutate(whole, rng) if k % 2 else dicom_bytes(compressed_slice(syntax, mutate(good, rng)), syntax)
+            read(tmp_path / "f.dcm", raw)
+    (unharmed,) = read(tmp_path / "f.dcm", whole)
+    assert isinstance(unharmed, Slice)
+
+
+def test_a_decoder_that_spins_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    syntax = "1.2.840.10008.1.2.4.70"
+    if not codec_available(syntax):
+        pytest.skip("the codecs extra is not installed")
+    process = dicom_decoding._DecoderProcess()
+    spinning = subprocess.Popen(
+        [sys.executable, "-c", "import time; time.sleep(600)"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    process._process = spinning
+    monkeypatch.setattr(dicom_decoding, "_process_of", lambda pid: process)
+    monkeypatch.setattr(dicom_decoding, "TIMEOUT_S", 0.2)
+    path = write_dicom(tmp_path / "a.dcm", compressed_slice(syntax), syntax)
+    records = read_dicom(path, "a.dcm")
+    assert not isinstance(records, NotAnImage)
+    (record,) = records
+    broken_off = record.load()
+    assert isinstance(broken_off, UnreadableSlice)
+    assert broken_off.problem.startswith("Pixel Data (7FE0,0010)")
+    assert spinning.poll() is not None
+    monkeypatch.setattr(dicom_decoding, "TIMEOUT_S", 60.0)
+    assert isinstance(record.load(), Slice)
+    process.stop()
 
 
 def test_damaged_png(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -59,6 +61,29 @@ def test_a_spot_is_drawn_where_it_is(slice_: Slice) -> None:
     rows, columns = np.nonzero((left == MATCHED).all(axis=2))
     middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
     np.testing.assert_allclose(middle, (uv + 0.5) * PANEL / SIZE, atol=1.0)
+
+
+@pytest.mark.parametrize("at", [(102.0, 97.0), (180.0, 20.0)])
+def test_a_reason_is_written_where_its_candidate_is_seen_closest(slice_: Slice, at: tuple[float, float]) -> None:
+    """Three spots in the middle have a close-up beside the whole slice; a candidate far away is seen in this only."""
+    spots = spots_at(np.array([[95.0, 95.0], [105.0, 95.0], [100.0, 105.0]]))
+    with_reason, without = (
+        np.asarray(
+            draw_overlay(
+                slice_,
+                dataclasses.replace(spots, rejected=(RejectedSpot(u_px=at[0], v_px=at[1], reason=reason),)),
+                labels=dict.fromkeys(range(3), ""),
+                show_rejected=True,
+            )
+        )
+        for reason in ("too_large", "")
+    )
+    panel = MARGIN + PANEL
+    assert with_reason.shape[1] > 2 * panel
+    changed = (with_reason != without).any(axis=(0, 2))
+    close = at[0] < 150
+    assert changed[:panel].any() != close
+    assert changed[panel:].any() == close
 
 
 def test_no_label_covers_a_spot(slice_: Slice) -> None:

@@ -1,0 +1,70 @@
+"""The profile's derivatives, and spots seen along their own axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctreg_cli.imaging.plateau import LongSpots
+from ctreg_cli.imaging.profile import FLATNESS, N_PARAMETERS, Rows, moved
+from ctreg_cli.imaging.segmentation import find_spots
+from tests.imaging.rendering import as_slice, render_rod
+
+#: centre; ln height; background; gradient; shape; flatness, of two spots
+PARAMETERS = np.array(
+    [[0.3, -0.2, 5.0, 12.0, 0.4, -0.7, -0.6, 0.1, -0.4, 0.2], [-0.4, 0.1, 6.0, -3.0, 0.1, 0.2, -1.2, -0.05, -0.3, 0.6]]
+).T
+
+
+@pytest.mark.parametrize("long", [None, (False, True), (True, True)])
+def test_the_derivatives_are_those_of_the_profile(long: tuple[bool, bool] | None) -> None:
+    v, u = (axis.ravel().astype(float) for axis in np.mgrid[-6:7, -6:7])
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, (2, u.size))
+    values, mask = np.zeros((2, u.size)), None
+    if long is not None:
+        mask, u, v = np.array(long), np.tile(u, (2, 1)), np.tile(v, (2, 1))
+    rows = Rows(u, v, values, None, weights, mask)
+
+    def profile(parameters: np.ndarray) -> np.ndarray:
+        rows.evaluate(parameters)
+        return -rows.by_spot[:, -1]
+
+    e = 1e-5
+    for i in range(N_PARAMETERS):
+        step = np.zeros_like(PARAMETERS)
+        step[i] = e
+        # rows 6 to 8 stretch ξ and η themselves: to first order in the step
+        numeric = (profile(moved(PARAMETERS, step)) - profile(moved(PARAMETERS, -step))) / (2 * e)
+        rows.evaluate(PARAMETERS)
+        np.testing.assert_allclose(rows.by_spot[:, i], numeric, atol=2e-6 * np.abs(numeric).max() + 1e-6)
+
+
+def test_a_part_of_the_spots_has_their_rows() -> None:
+    v, u = (np.tile(axis.ravel().astype(float), (2, 1)) for axis in np.mgrid[-6:7, -6:7])
+    u[1] += 0.3
+    rows = Rows(u, v, np.zeros((2, u.shape[1])), None, np.ones((2, u.shape[1])), np.array([False, True]))
+    both = rows.evaluate(PARAMETERS)
+    one = rows.take(np.array([1])).evaluate(PARAMETERS[:, [1]])
+    np.testing.assert_allclose(one[0], both[1])
+
+
+def test_only_long_spots_are_turned_and_turned_back() -> None:
+    angle = 0.4
+    turn = np.array([[[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]])
+    long = LongSpots(mask=np.array([False, True]), index=np.array([1]), turn=turn)
+    vectors = np.array([[1.0, np.cos(angle)], [2.0, np.sin(angle)]])
+    turned = long.turned(vectors)
+    np.testing.assert_allclose(turned, [[1.0, 1.0], [2.0, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(long.turned_back(turned), vectors)
+    moments = np.stack([np.diag([2.0, 1.0]), turn[0].T @ np.diag([5.0, 1.0]) @ turn[0]])
+    np.testing.assert_allclose(long.turned_moments(moments), [np.diag([2.0, 1.0]), np.diag([5.0, 1.0])], atol=1e-12)
+
+
+def test_turning_the_picture_turns_a_long_spot_and_its_covariance() -> None:
+    rod = {"thickness_mm": 5.0, "slope": (1.0, 0.4), "contrast": 9000.0}
+    image = render_rod((71, 71), (35.2, 34.9), **rod) + np.random.default_rng(1).normal(0.0, 20.0, (71, 71))
+    spot, turned = (find_spots(as_slice(values, thickness_mm=5.0)) for values in (image, image.T))
+    assert spot.major_px[0] > 2 * spot.minor_px[0]
+    assert FLATNESS == N_PARAMETERS - 1
+    np.testing.assert_allclose(turned.uv_px[0, ::-1], spot.uv_px[0], atol=1e-3)
+    np.testing.assert_allclose(turned.covariance_px[0][::-1, ::-1], spot.covariance_px[0], rtol=0.02, atol=1e-7)
