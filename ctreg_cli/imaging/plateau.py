@@ -57,6 +57,21 @@ class LongSpots:
     def __len__(self) -> int:
         return len(self.index)
 
+    def take(self, which: BoolArray | IntArray) -> LongSpots:
+        """Of some of the spots."""
+        turn = np.zeros((len(self.mask), 2, 2))
+        turn[self.index] = self.turn
+        mask = self.mask[which]
+        return LongSpots(mask=mask, index=np.flatnonzero(mask), turn=turn[which][mask])
+
+    def joined(self, other: LongSpots) -> LongSpots:
+        """Of these spots and others."""
+        return LongSpots(
+            mask=np.concatenate([self.mask, other.mask]),
+            index=np.concatenate([self.index, len(self.mask) + other.index]),
+            turn=np.concatenate([self.turn, other.turn]),
+        )
+
     def coordinates(self, u: FloatArray, v: FloatArray) -> FloatArray:
         """Coordinates (2, p) of pixels as every spot sees them: (2, k, p)."""
         seen = np.repeat(np.stack([u, v])[:, None], len(self.mask), axis=1)
