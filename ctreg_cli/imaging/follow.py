@@ -64,7 +64,7 @@ AXES_MEMORY, MAX_CHANGE, LONG_DOUBT = 4.0, 1.5, 1.15
 MAX_MISFIT = 3.0
 #: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
 #: changes by this factor, or the flatness of a long spot by so much; structure about a spot is looked at in every slice
-LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 16, 2.0, 0.15
+LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 32, 1.7, 0.15
 #: everything is measured in full again after so many slices
 MAX_AGE = 64
 #: after a spot could not be learned, that is not tried for so many slices, twice as many each time
@@ -199,7 +199,7 @@ class Follower:
             contrast=fitted.height * windows.unit,
             major_px=region.axes[0],
             minor_px=region.axes[1],
-            angle_rad=region.axes[2],
+            angle_rad=region.angle,
         )
         known.seen(fitted, region)
         if good.all():
@@ -284,7 +284,7 @@ class _Known:
         self.parameters, self.ceiling = fitted.parameters, fitted.ceiling
         self.level = background + START_LEVEL * fitted.height
         self.half = background + 0.5 * fitted.height
-        self.axes = self.axes + (region.axes[:2] - self.axes) / AXES_MEMORY
+        self.axes = self.axes + (region.axes - self.axes) / AXES_MEMORY
 
     def take(self, which: BoolArray | IntArray) -> _Known:
         """Some of the rods."""
@@ -327,17 +327,19 @@ class _Region:
     area: FloatArray
     middle: FloatArray
     moments: FloatArray
-    #: (3, k) long and short axis, px, and angle, rad
+    #: (2, k) long and short axis, px; and the angle (k,) of the long one, rad
     axes: FloatArray
+    angle: FloatArray
 
     @classmethod
     def of(cls, own: BoolArray) -> _Region:
         area, middle, moments = moments_of(own, _monomials())
-        return cls(own=own, area=area, middle=middle, moments=moments, axes=np.array(axes_of(moments)))
+        long, thick, angle = axes_of(moments)
+        return cls(own=own, area=area, middle=middle, moments=moments, axes=np.array([long, thick]), angle=angle)
 
     def is_that_of(self, known: _Known) -> BoolArray:
         """Whether (k,) a spot is as long and thick as it was, and has not become long or round."""
-        change, (long, thick) = self.axes[:2] / known.axes, known.axes
+        change, (long, thick) = self.axes / known.axes, known.axes
         same = ((change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)).all(axis=0)
         doubt = np.where(known.long.mask, 1.0 / LONG_DOUBT, LONG_DOUBT) * LONG_RATIO
         same &= (long > doubt * thick) == known.long.mask
@@ -424,6 +426,7 @@ def _stepped(
     fitted = Profiles(
         parameters=parameters,
         long=known.long,
+        centre=parameters[CENTRE] if long is None else long.turned_back(parameters[CENTRE]),
         normal=normal,
         rows=rows,
         residuals=rows.by_spot[:, -1] / root_weights,

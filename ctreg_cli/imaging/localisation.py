@@ -81,9 +81,11 @@ class Centres:
 class Profiles:
     """Profiles fitted to ``k`` blobs; ``p`` pixels in the disc of each window."""
 
-    #: (10, k), centres from the windows' middles, px; long spots are seen along their own axes
+    #: (10, k); long spots are seen along their own axes
     parameters: FloatArray
     long: LongSpots
+    #: (2, k) from the windows' middles, px
+    centre: FloatArray
     #: (k, 10, 10), of the steps of :func:`ctreg_cli.imaging.profile.moved`
     normal: FloatArray
     #: derivatives and weighted residuals at ``parameters``
@@ -101,12 +103,6 @@ class Profiles:
     n_clipped: IntArray
     #: value at which the image is cut off
     ceiling: float
-
-    @property
-    def centre(self) -> FloatArray:
-        """(2, k) from the windows' middles, px."""
-        centre = self.parameters[CENTRE]
-        return self.long.turned_back(centre) if len(self.long) else centre
 
 
 def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
@@ -167,6 +163,7 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
     return Profiles(
         parameters=parameters,
         long=long,
+        centre=long.turned_back(parameters[CENTRE]),
         normal=normal,
         rows=rows,
         residuals=rows.by_spot[:, -1] / root_weights,
