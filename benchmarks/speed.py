@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from ctreg_cli import pipeline
 from ctreg_cli.geometry.projection import project
-from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.imaging.follow import Follower
 from ctreg_cli.io.images import open_images
 from ctreg_cli.io.results import ResultsHeader, results_encoding
 from ctreg_cli.io.rod_file import load_rod_model
@@ -65,8 +65,7 @@ def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
     """All stages in turn, slice by slice; ``spots`` and ``tracker`` are parts of ``track``."""
     stages = Stages(len(files))
     clock = time.perf_counter
-    segmentation = SegmentationOptions()
-    measure = pipeline.measure_spots
+    measure = Follower.measure
     spent = 0.0
 
     def timed(*arguments: object, **named: object) -> object:
@@ -76,13 +75,14 @@ def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
         spent += clock() - began
         return found
 
-    pipeline.measure_spots = timed  # type: ignore[assignment]
+    Follower.measure = timed  # type: ignore[method-assign, assignment]
     try:
         for _ in range(repeats):
-            tracker = Tracker(model)
-            t0 = clock()
+            tracker, follower = Tracker(model), Follower(pipeline.expecting(model, None))
+            # all headers at once are too long for the machine to leave them undisturbed: processor time
+            t0 = time.thread_time()
             series = open_images([files[0].parent])
-            header = (clock() - t0) / len(files)
+            header = (time.thread_time() - t0) / len(files)
             with open_sinks(["-"], results_encoding(ResultsHeader(model=model)), io.StringIO()) as sinks:
                 for i, (file, record) in enumerate(zip(files, series.records, strict=True)):
                     spent = 0.0
@@ -91,7 +91,7 @@ def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
                     t1 = clock()
                     slice_ = record.load()
                     t2 = clock()
-                    result = pipeline.track_slice(i, slice_, tracker, scale=None, segmentation=segmentation)
+                    result = pipeline.track_slice(i, slice_, tracker, follower, scale=None)
                     t3 = clock()
                     sinks.write(result)
                     t4 = clock()
@@ -102,7 +102,7 @@ def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
                     stages.note("tracker", i, t3 - t2 - spent)
                     stages.note("row", i, t4 - t3)
     finally:
-        pipeline.measure_spots = measure
+        Follower.measure = measure  # type: ignore[method-assign]
     return stages
 
 

@@ -17,6 +17,9 @@ def frozen(values: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
         ValueError: another shape; the message quotes both.
     """
     array = np.array(values, dtype=np.float64)
+    if array.shape == shape and array.size:  # nearly always, and the tests below are slow
+        array.setflags(write=False)
+        return array
     if array.size == 0 and 0 in (0 if n is None else n for n in shape):
         array = array.reshape([0 if n is None else n for n in shape])
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):

@@ -15,7 +15,8 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray, frozen
 from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.geometry.plucker import skew
-from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots, measure_spots
+from ctreg_cli.imaging.follow import Follower
+from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
@@ -213,7 +214,7 @@ def track(
         MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
     """
     segmentation = expecting(model, segmentation)
-    tracker = Tracker(model, options)
+    tracker, follower = Tracker(model, options), Follower(segmentation)
     seen_scale = scale is not None
     for place, slice_ in enumerate(slices):
         seen_scale |= slice_.info.scale is not None
@@ -222,24 +223,25 @@ def track(
             item = spots_of(slice_, segmentation)
             yield failure(place if item.index is None else item.index, item, "no_scale")
             continue
-        yield track_slice(place, slice_, tracker, scale=scale, segmentation=segmentation)
+        yield track_slice(place, slice_, tracker, follower, scale=scale)
 
 
 def track_slice(
-    place: int, slice_: SliceLike, tracker: Tracker, *, scale: Scale | None, segmentation: SegmentationOptions
+    place: int, slice_: SliceLike, tracker: Tracker, follower: Follower, *, scale: Scale | None
 ) -> FrameResult:
-    """The next slice of a sequence."""
+    """The next slice of a sequence; ``tracker`` and ``follower`` are the sequence's own."""
     if isinstance(slice_, Slice):
         override = scale or slice_.info.scale
         prediction = None if override is None else tracker.predict(slice_.info, override)
         if override is not None and prediction is not None:
-            where = prediction.visible & _inside(prediction.spots_px, slice_.info.shape)
-            spots = measure_spots(slice_, prediction.spots_px[where], prediction.radius_px[where], segmentation)
+            rods = np.flatnonzero(prediction.visible & _inside(prediction.spots_px, slice_.info.shape))
+            spots = follower.measure(slice_, rods, prediction.spots_px[rods], prediction.radius_px[rods])
             tracked = tracker.follow(spots, slice_.info, override)
             if tracked is not None:
                 item = SpotSlice(info=slice_.info, spots=spots)
                 return _tracked_result(place, item, tracker, tracked)
-    item = spots_of(slice_, segmentation)
+    follower.forget()
+    item = spots_of(slice_, follower.options)
     if item.problem:
         tracker.miss()
         return failure(place if item.index is None else item.index, item, "unreadable")

@@ -27,6 +27,7 @@ CORE_PX = 2.0
 LONE_SPREADS, LONE_SHARES = 7.0, (0.1, 0.2)
 #: a pixel is 1/12 px² wide in second moments
 _PIXEL_VARIANCE = 1.0 / 12.0
+_UNIT = np.eye(2)
 
 _ARRAYS = ("middles", "values", "background", "height", "own", "foreign", "centre", "moments")
 
@@ -62,11 +63,7 @@ class Blobs:
     @property
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Full length (k,) of the long and the short axis of the uniform ellipse with these moments, px; angle, rad."""
-        half_trace = 0.5 * (self.moments[:, 0, 0] + self.moments[:, 1, 1])
-        half_difference = 0.5 * (self.moments[:, 0, 0] - self.moments[:, 1, 1])
-        root = np.hypot(half_difference, self.moments[:, 0, 1])
-        major, minor = 4.0 * np.sqrt(half_trace + root), 4.0 * np.sqrt(np.maximum(half_trace - root, 0.0))
-        return major, minor, 0.5 * np.arctan2(self.moments[:, 0, 1], half_difference)
+        return axes_of(self.moments)
 
     @property
     def area(self) -> FloatArray:
@@ -215,18 +212,37 @@ def _core(radius: int) -> IntArray:
     return frozen_index(np.flatnonzero(np.hypot(*grid(radius)) < CORE_PX))
 
 
+def axes_of(moments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """:attr:`Blobs.axes` of second moments (k, 2, 2)."""
+    uu, uv, vv = moments[:, 0, 0], moments[:, 0, 1], moments[:, 1, 1]
+    half_trace, half_difference = 0.5 * (uu + vv), 0.5 * (uu - vv)
+    root = np.hypot(half_difference, uv)
+    major, minor = 4.0 * np.sqrt(half_trace + root), 4.0 * np.sqrt(np.maximum(half_trace - root, 0.0))
+    return major, minor, 0.5 * np.arctan2(uv, half_difference)
+
+
 def _moments(own: BoolArray, radius: int) -> tuple[FloatArray, FloatArray]:
     """Centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, n, n), px."""
-    sums = own.reshape(len(own), -1).astype(np.float64) @ _monomials(radius)
-    sums /= np.maximum(sums[:, :1], 1.0)
-    centre = sums[:, 1:3].copy()
-    moments = sums[:, 3:].reshape(-1, 2, 2) - centre[:, :, None] * centre[:, None]
-    moments += _PIXEL_VARIANCE * np.eye(2)
+    _, centre, moments = moments_of(own.reshape(len(own), -1), monomials(radius))
     return centre, moments
 
 
+def moments_of(own: BoolArray, monomials: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Areas (k,), centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, p), px.
+
+    ``monomials`` are those of the pixels, (p, 7) rows of :func:`monomials`.
+    """
+    sums = own.astype(np.float64) @ monomials
+    area = sums[:, 0].copy()
+    sums /= np.maximum(sums[:, :1], 1.0)
+    centre = sums[:, 1:3].copy()
+    moments = sums[:, 3:].reshape(-1, 2, 2) - centre[:, :, None] * centre[:, None]
+    moments += _PIXEL_VARIANCE * _UNIT
+    return area, centre, moments
+
+
 @cache
-def _monomials(radius: int) -> FloatArray:
+def monomials(radius: int) -> FloatArray:
     """(n², 7): 1; u, v; u², uv, uv, v² at the pixels of a window."""
     u, v = (axis.ravel() for axis in grid(radius))
     return frozen(np.stack([np.ones(u.size), u, v, u * u, u * v, u * v, v * v], axis=1), (u.size, 7))

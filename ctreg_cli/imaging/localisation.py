@@ -8,6 +8,7 @@ what a steep edge seen in few pixels costs, and of a long spot the chance that i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,7 @@ from ctreg_cli.imaging.uncertainty import (
     centre_covariance,
     noise_field,
     odd_variance,
+    responses,
     ring_spread,
 )
 from ctreg_cli.imaging.window import dilated, disc, grid
@@ -75,6 +77,34 @@ class Centres:
     noise: FloatArray
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Profiles:
+    """Profiles fitted to ``k`` blobs; ``p`` pixels in the disc of each window."""
+
+    #: (10, k); long spots are seen along their own axes
+    parameters: FloatArray
+    long: LongSpots
+    #: (2, k) from the windows' middles, px
+    centre: FloatArray
+    #: (k, 10, 10), of the steps of :func:`ctreg_cli.imaging.profile.moved`
+    normal: FloatArray
+    #: derivatives and weighted residuals at ``parameters``
+    rows: Rows
+    #: (k, p) residuals, not weighted
+    residuals: FloatArray
+    #: (k,) sd of the noise by which pixels were weighted, and by how much structure adds to that a pixel farther out
+    noise: FloatArray
+    structure_slope: FloatArray
+    #: (k, p) where the structure that disturbs a blob is looked at, and where the pixel noise
+    near: BoolArray
+    quiet: BoolArray
+    #: (k,) height of the blobs, as far as it is not cut off, and how many of their pixels are
+    height: FloatArray
+    n_clipped: IntArray
+    #: value at which the image is cut off
+    ceiling: float
+
+
 def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     """Fit the profile to every blob.
 
@@ -85,6 +115,21 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
         blobs: windows of one radius.
         ceiling: value at which the image is cut off; pixels of that value are taken as "at least so bright".
     """
+    fitted = fit_profiles(blobs, ceiling)
+    law = centre_law(fitted, centre_columns(fitted.normal), blobs.radius)
+    covariance = law.covariance(structure_near(fitted, law.rough, blobs.radius))
+    uv = fitted.centre.T
+    away = ((uv - blobs.centre) ** 2).sum(axis=1)
+    size = np.trace(blobs.moments, axis1=1, axis2=2)
+    found = np.isfinite(uv).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (away <= size)
+    if not found.all():
+        uv = np.where(found[:, None], uv, blobs.centre)
+        covariance = np.where(found[:, None, None], covariance, blobs.moments)
+    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=law.rough)
+
+
+def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
+    """Fit the profile to every blob; arguments as :func:`fit_centres`."""
     k = len(blobs)
     at = disc(blobs.radius)
     u, v = (axis.ravel()[at] for axis in grid(blobs.radius))
@@ -92,7 +137,7 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     usable = ~np.isnan(values)
     if not usable.all():
         values = np.where(usable, values, blobs.background[:, None])
-    distance = _distance_beyond_edge(blobs, u, v)
+    distance = distance_beyond_edge(blobs.moments, u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None])
     near = (distance > NEAR_PX[0]) & (distance < NEAR_PX[1]) & usable
     if blobs.foreign.any():
         foreign = dilated(blobs.foreign).reshape(k, -1)[:, at] & usable
@@ -102,10 +147,10 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
 
     noise, structure = ring_spread(blobs)
     reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
-    spread = (STRUCTURE_WEIGHT * structure / reach)[:, None] * distance
-    spread *= spread
-    spread += (noise * noise)[:, None]
-    root_weights = np.sqrt(np.where(usable, 1.0, LEFT_OUT) / spread)
+    structure_slope = STRUCTURE_WEIGHT * structure / reach
+    root_weights = root_pixel_weights(distance, noise, structure_slope)
+    if not usable.all():
+        root_weights = np.where(usable, root_weights, math.sqrt(LEFT_OUT) * root_weights)
 
     brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
     long = LongSpots.of(blobs)
@@ -115,29 +160,104 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     else:
         rows = Rows(u, v, values, clipped, root_weights)
     parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
+    return Profiles(
+        parameters=parameters,
+        long=long,
+        centre=long.turned_back(parameters[CENTRE]),
+        normal=normal,
+        rows=rows,
+        residuals=rows.by_spot[:, -1] / root_weights,
+        noise=noise,
+        structure_slope=structure_slope,
+        near=near,
+        quiet=usable & (distance > NOISE_BEYOND_PX),
+        height=blobs.height,
+        n_clipped=n_clipped,
+        ceiling=ceiling,
+    )
 
-    shift = np.linalg.solve(normal, np.broadcast_to(np.eye(N_PARAMETERS, 2), (k, N_PARAMETERS, 2)))
-    influence = (shift.transpose(0, 2, 1) @ rows.by_spot[:, :-1] * root_weights[:, None]).transpose(1, 0, 2)
-    influence = in_pixels(parameters, influence)
-    centre = parameters[CENTRE]
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Law:
+    """What noise and structure make of ``k`` fitted centres."""
+
+    #: (3, k, 2, 2), see :func:`ctreg_cli.imaging.uncertainty.responses`
+    response: FloatArray
+    #: (k,) sd of the noise as a smooth field, and of what differs from pixel to pixel
+    smooth: FloatArray
+    rough: FloatArray
+    #: (k,) factor for faint spots
+    faint: FloatArray
+    #: (k, 2, 2) covariance that a perfect fit has as well, px²
+    least: FloatArray
+
+    def covariance(self, structure: FloatArray, factor: FloatArray | None = None) -> FloatArray:
+        """(k, 2, 2) px², for a ``structure`` of this variance (k,) about each spot.
+
+        ``factor`` (k,) is by how much worse, in variance, the centres are known now than where the law was measured.
+        """
+        scale = self.faint if factor is None else self.faint * factor
+        covariance = centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
+        covariance *= scale[:, None, None]
+        covariance += self.least
+        return covariance
+
+    def take(self, which: BoolArray | IntArray) -> Law:
+        """Of some of the centres."""
+        return Law(
+            response=self.response[:, which],
+            smooth=self.smooth[which],
+            rough=self.rough[which],
+            faint=self.faint[which],
+            least=self.least[which],
+        )
+
+    def joined(self, other: Law) -> Law:
+        """Of these centres and others."""
+        return Law(
+            response=np.concatenate([self.response, other.response], axis=1),
+            smooth=np.concatenate([self.smooth, other.smooth]),
+            rough=np.concatenate([self.rough, other.rough]),
+            faint=np.concatenate([self.faint, other.faint]),
+            least=np.concatenate([self.least, other.least]),
+        )
+
+
+def centre_columns(normal: FloatArray) -> FloatArray:
+    """(k, 10, 2): the first two columns of the inverses of normal matrices (k, 10, 10)."""
+    wanted = np.broadcast_to(np.eye(N_PARAMETERS, 2), (len(normal), N_PARAMETERS, 2))
+    return np.asarray(np.linalg.solve(normal, wanted), dtype=np.float64)
+
+
+def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
+    """The law of fitted centres, measured in their windows.
+
+    Args:
+        fitted: the profiles.
+        shift: (k, 10, 2), see :func:`centre_columns`.
+        radius: of the windows, px.
+    """
+    by_spot, root_weights, long = fitted.rows.by_spot, fitted.rows.root_weights, fitted.long
+    influence = (shift.transpose(0, 2, 1) @ by_spot[:, :-1] * root_weights[:, None]).transpose(1, 0, 2)
+    influence = in_pixels(fitted.parameters, influence)
     if len(long):
-        centre, influence = long.turned_back(centre), long.turned_back(influence)
-    residuals = rows.by_spot[:, -1] / root_weights
-    rough, smooth, length = noise_field(residuals, usable & (distance > NOISE_BEYOND_PX), blobs.radius)
-    structure = odd_variance(residuals, near, centre, blobs.radius, rough) / KEPT
-    covariance = centre_covariance(influence, blobs.radius, smooth=(smooth, length), rough=rough, structure=structure)
-    covariance *= (1.0 + (FAINT_SD * rough / blobs.height) ** 3)[:, None, None]
-    covariance += _of_pixels(parameters, long.mask, n_clipped > 0, ceiling)[:, None, None] * np.eye(2)
+        influence = long.turned_back(influence)
+    rough, smooth, length = noise_field(fitted.residuals, fitted.quiet, radius)
+    least = _of_pixels(fitted.parameters, long.mask, fitted.n_clipped > 0, fitted.ceiling)[:, None, None] * np.eye(2)
     if len(long):
-        covariance[long.index] += long.pair_covariance(parameters, rows.by_spot, normal)
-    uv = centre.T
-    away = ((uv - blobs.centre) ** 2).sum(axis=1)
-    size = np.trace(blobs.moments, axis1=1, axis2=2)
-    found = np.isfinite(uv).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)) & (away <= size)
-    if not found.all():
-        uv = np.where(found[:, None], uv, blobs.centre)
-        covariance = np.where(found[:, None, None], covariance, blobs.moments)
-    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=rough)
+        least[long.index] += long.pair_covariance(fitted.parameters, by_spot, fitted.normal)
+    return Law(
+        response=responses(influence, radius, length),
+        smooth=smooth,
+        rough=rough,
+        faint=1.0 + (FAINT_SD * rough / fitted.height) ** 3,
+        least=least,
+    )
+
+
+def structure_near(fitted: Profiles, rough: FloatArray, radius: int) -> FloatArray:
+    """Variance (k,) of the background structure that disturbs fitted centres, beyond noise of sd ``rough`` (k,)."""
+    return odd_variance(fitted.residuals, fitted.near, fitted.centre, radius, rough) / KEPT
 
 
 def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolArray | None, IntArray]:
@@ -160,22 +280,34 @@ def _of_pixels(parameters: FloatArray, long: BoolArray, clipped: BoolArray, ceil
     return np.asarray(np.where(clipped, np.maximum(sd, cut_sd), sd) ** 2)
 
 
-def _distance_beyond_edge(blobs: Blobs, u: FloatArray, v: FloatArray) -> FloatArray:
-    """Distance (k, p) of pixels outside the ellipse of the blob's half-height moments, px; 0 inside."""
-    x, y = u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None]
-    uu, uv, vv = inverse_elements(
-        4.0 * blobs.moments
-    )  # a uniform ellipse has moments of a quarter of its semi-axes squared
+def distance_beyond_edge(moments: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance (k, p) of points outside the uniform ellipses with these second moments, px; 0 inside.
+
+    Args:
+        moments: (k, 2, 2) px².
+        x: (k, p) from the ellipse's middle, px.
+        y: likewise.
+    """
+    uu, uv, vv = inverse_elements(4.0 * moments)  # such an ellipse has a quarter of its semi-axes squared
     xx, yy = x * x, y * y
     q = uu[:, None] * xx
     q += vv[:, None] * yy
-    x *= y
-    x *= 2.0 * uv[:, None]
-    q += x
+    xy = x * y
+    xy *= 2.0 * uv[:, None]
+    q += xy
     xx += yy
     distance = np.sqrt(xx)
     distance -= np.sqrt(xx / np.maximum(q, 1e-18))
     return np.maximum(distance, 0.0, out=distance)
+
+
+def root_pixel_weights(distance: FloatArray, noise: FloatArray, structure_slope: FloatArray) -> FloatArray:
+    """Roots of the weights (k, p) of pixels so far beyond an edge: noise (k,) everywhere, and structure that grows."""
+    spread = structure_slope[:, None] * distance
+    spread *= spread
+    spread += (noise * noise)[:, None]
+    np.sqrt(spread, out=spread)
+    return np.asarray(1.0 / spread)
 
 
 def _brightest(blobs: Blobs, values: FloatArray, about: BoolArray, u: FloatArray, v: FloatArray) -> FloatArray:

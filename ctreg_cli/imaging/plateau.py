@@ -41,45 +41,53 @@ class LongSpots:
     mask: BoolArray
     #: (m,) the same as indices
     index: IntArray
-    #: (m, 2, 2) rotations: image → along and across the spot
-    turn: FloatArray
+    #: (k, 2, 2) rotations: image → along and across the spot, or for those that are not long, none
+    rotation: FloatArray
 
     @classmethod
     def of(cls, blobs: Blobs) -> LongSpots:
         """By the moments of the half-height regions."""
         major, minor, angle = blobs.axes
         mask = major > LONG_RATIO * minor
-        cos, sin = np.cos(angle[mask]), np.sin(angle[mask])
+        angle = np.where(mask, angle, 0.0)
+        cos, sin = np.cos(angle), np.sin(angle)
         return cls(
-            mask=mask, index=np.flatnonzero(mask), turn=np.stack([cos, sin, -sin, cos], axis=1).reshape(-1, 2, 2)
+            mask=mask, index=np.flatnonzero(mask), rotation=np.stack([cos, sin, -sin, cos], axis=1).reshape(-1, 2, 2)
         )
 
     def __len__(self) -> int:
         return len(self.index)
 
+    def take(self, which: BoolArray | IntArray) -> LongSpots:
+        """Of some of the spots."""
+        mask = self.mask[which]
+        return LongSpots(mask=mask, index=np.flatnonzero(mask), rotation=self.rotation[which])
+
+    def joined(self, other: LongSpots) -> LongSpots:
+        """Of these spots and others."""
+        mask = np.concatenate([self.mask, other.mask])
+        rotation = np.concatenate([self.rotation, other.rotation])
+        return LongSpots(mask=mask, index=np.flatnonzero(mask), rotation=rotation)
+
     def coordinates(self, u: FloatArray, v: FloatArray) -> FloatArray:
         """Coordinates (2, p) of pixels as every spot sees them: (2, k, p)."""
-        seen = np.repeat(np.stack([u, v])[:, None], len(self.mask), axis=1)
-        seen[:, self.index] = (self.turn @ np.stack([u, v])).transpose(1, 0, 2)
+        seen: FloatArray = (self.rotation @ np.stack([u, v])).transpose(1, 0, 2)
         return seen
 
     def turned(self, vectors: FloatArray) -> FloatArray:
         """Vectors (2, k) of the image along and across the spots."""
-        result = vectors.copy()
-        result[:, self.index] = np.einsum("mij,jm->im", self.turn, vectors[:, self.index])
+        result: FloatArray = (self.rotation @ vectors.T[:, :, None])[:, :, 0].T
         return result
 
     def turned_moments(self, moments: FloatArray) -> FloatArray:
         """Second moments (k, 2, 2) along and across the spots."""
-        result = moments.copy()
-        result[self.index] = self.turn @ moments[self.index] @ self.turn.transpose(0, 2, 1)
-        return result
+        return np.asarray(self.rotation @ moments @ self.rotation.transpose(0, 2, 1))
 
     def turned_back(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (2, k, ...) along and across the spots in the image."""
-        result = vectors.copy()
-        result[:, self.index] = np.einsum("mji,jm...->im...", self.turn, vectors[:, self.index])
-        return result
+        """Vectors (2, k) or (2, k, p) along and across the spots in the image."""
+        by_spot = vectors.reshape(2, len(self.mask), -1).transpose(1, 0, 2)
+        back = self.rotation.transpose(0, 2, 1) @ by_spot
+        return np.asarray(back.transpose(1, 0, 2)).reshape(vectors.shape)
 
     def pair_covariance(self, parameters: FloatArray, by_spot: FloatArray, normal: FloatArray) -> FloatArray:
         """What the centres (m, 2, 2), px², owe to the chance that the long spots are two rods each.
@@ -102,7 +110,7 @@ class LongSpots:
         )
         spread = PAIR_SHARE * np.maximum(along**2 - across**2, 0.0) / (1.0 + np.exp(-log_odds) / PAIR_ODDS)
         axis = np.stack([np.ones(len(self)), -fitted[SHAPE][1] * across], axis=1)  # where η = 0
-        axis = np.einsum("mji,mj->mi", self.turn, axis / np.linalg.norm(axis, axis=1, keepdims=True))
+        axis = np.einsum("mji,mj->mi", self.rotation[self.index], axis / np.linalg.norm(axis, axis=1, keepdims=True))
         shape = axis[:, :, None] * axis[:, None, :] + ASIDE * np.eye(2)
         return np.asarray(spread[:, None, None] * shape)
 

@@ -86,7 +86,6 @@ class Rows:
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
         self._rows[3], self._rows[4], self._rows[5] = root_weights, root_weights * u, root_weights * v
-        self._background = self._rows[3:6].copy() if clipped is not None else None
         #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
         self.by_spot = self._rows.transpose(1, 0, 2)
 
@@ -105,8 +104,6 @@ class Rows:
         pixel says only "at least this bright": where the profile is brighter still, it takes no part.
         """
         rows = self._rows
-        if self._background is not None:  # some were set to zero below
-            rows[3:6] = self._background
         centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, flatness = parameters[:, :, None]
         x = self._u - centre_u
         xi = np.exp(l0) * x
@@ -145,5 +142,6 @@ class Rows:
         residuals -= g_v * rows[5]
         self.by_spot = rows.transpose(1, 0, 2)
         if self._clipped is not None:
-            rows[:, self._clipped & (residuals <= 0)] = 0.0
-        return np.asarray(self.by_spot @ self.by_spot.transpose(0, 2, 1))
+            satisfied = self._clipped & (residuals <= 0)
+            self.by_spot = np.where(satisfied[:, None], 0.0, self.by_spot)
+        return np.asarray(self.by_spot @ rows.transpose(1, 2, 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 
 #: standard deviation (px, each coordinate) given to spots that come without one
 DEFAULT_SPOT_SD_PX = 0.25
+
+_ARRAYS = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,9 +68,13 @@ class Spots:
 
     def take(self, which: BoolArray | IntArray) -> Spots:
         """Some of the spots; the rejected candidates stay."""
-        names = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
-        arrays = {name: getattr(self, name)[which] for name in names}
+        arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
         return Spots(**arrays, sd_assumed=self.sd_assumed, rejected=self.rejected)
+
+    def joined(self, other: Spots) -> Spots:
+        """These spots and others of the same slice, all measured."""
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS}
+        return Spots(**arrays, rejected=(*self.rejected, *other.rejected))
 
     @property
     def sd_px(self) -> FloatArray:

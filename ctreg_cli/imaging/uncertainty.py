@@ -145,36 +145,43 @@ def odd_variance(
     beyond. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; only odd
     ones do.
     """
-    k, side = len(residuals), 2 * (radius + _MARGIN) + 1
-    u, v = (axis.ravel()[disc(radius)] for axis in grid(radius))
-    at = ((v + radius + _MARGIN) * side + u + radius + _MARGIN).astype(np.intp)
-    square = np.full((k, side * side), np.nan)
-    known = np.where(near, residuals, np.nan)
-    square[:, at] = known
-    twice = np.rint(np.clip(2.0 * np.nan_to_num(centre), -_MARGIN, _MARGIN)).astype(np.intp)
-    mirror = (twice[1] * side + twice[0] + side * side - 1 + side * side * np.arange(k))[:, None] - at
-    odd = known - square.ravel().take(mirror)
-    paired = ~np.isnan(odd)
-    pairs = np.maximum(0.5 * np.count_nonzero(paired, axis=1), 1.0)
-    variance = 0.25 * np.where(paired, odd * odd, 0.0).sum(axis=1) / pairs
+    k, p = residuals.shape
+    known = np.empty((k, p + 1))
+    known.fill(np.nan)
+    np.copyto(known[:, :p], residuals, where=near)
+    twice = np.rint(np.fmax(np.fmin(2.0 * centre, _MARGIN), -_MARGIN)) + _MARGIN
+    opposite = _opposite(radius).take((twice[1] * (2 * _MARGIN + 1) + twice[0]).astype(np.intp), axis=0)
+    opposite += (p + 1) * np.arange(k)[:, None]
+    odd = known[:, :p] - known.take(opposite)
+    paired = odd == odd  # neither is NaN
+    pairs = np.maximum(0.5 * paired.sum(axis=1), 1.0)
+    odd *= odd
+    variance = 0.25 * np.where(paired, odd, 0.0).sum(axis=1) / pairs
     excess = variance / noise**2 - 1.0
     chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
     return np.asarray(noise**2 * excess * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
 
 
-def centre_covariance(
-    influence: FloatArray, radius: int, *, smooth: tuple[FloatArray, float], rough: FloatArray, structure: FloatArray
-) -> FloatArray:
-    """Covariance (k, 2, 2) of centres, by whichever tells more: smooth noise alone, or white noise and structure.
+@cache
+def _opposite(radius: int) -> IntArray:
+    """(n², p): the pixel of the disc opposite each, by twice the row and column of the middle between them.
 
-    Few pixels cannot tell a smooth kernel's noise from a streak; each of the two explains all that is seen.
+    The least of these is ``-_MARGIN``; where there is no such pixel, ``p`` stands, which is beyond the last.
+    """
+    u, v = (axis.ravel()[disc(radius)].astype(int).tolist() for axis in grid(radius))
+    place = {pixel: i for i, pixel in enumerate(zip(u, v, strict=True))}
+    steps = range(-_MARGIN, _MARGIN + 1)
+    table = [[place.get((du - x, dv - y), len(u)) for x, y in place] for dv in steps for du in steps]
+    return frozen_index(table).reshape(len(table), len(u))
+
+
+def responses(influence: FloatArray, radius: int, length: float) -> FloatArray:
+    """Covariances (3, k, 2, 2) of centres that fields of variance 1 make: smooth noise, white noise, and structure.
 
     Args:
         influence: (2, k, p), derivatives of the centres with respect to the pixels of the windows' discs.
         radius: of the windows, px.
-        smooth: sd (k,) of the noise as a smooth field, and its correlation length, px.
-        rough: (k,) sd of what differs from pixel to pixel.
-        structure: (k,) variance of background structure.
+        length: of the smooth noise's correlation, px.
     """
     k, n = influence.shape[1], 2 * radius + 1
     square = np.zeros((2, k, n * n))
@@ -182,13 +189,27 @@ def centre_covariance(
     waves = _waves(radius).T
     half = (square.reshape(-1, n) @ waves).reshape(2 * k, n, n).transpose(0, 2, 1)  # two large products beat 4 k small
     spectrum = (half.reshape(-1, n) @ waves).reshape(2, k, n * n).transpose(1, 0, 2)
-    noise, length = smooth
     along, across = _power_along(length, radius), _structure_power(radius)
     power = np.stack([np.outer(along, along).ravel(), np.ones(n * n), np.outer(across, across).ravel()])
-    of_smooth, of_white, of_structure = (spectrum * power[:, None, None]) @ spectrum.transpose(0, 2, 1)
-    of_smooth *= (noise * noise)[:, None, None]
-    of_white *= (rough * rough)[:, None, None]
-    of_white += structure[:, None, None] * of_structure
+    return np.asarray((spectrum * power[:, None, None]) @ spectrum.transpose(0, 2, 1))
+
+
+def centre_covariance(
+    response: FloatArray, *, smooth: FloatArray, rough: FloatArray, structure: FloatArray
+) -> FloatArray:
+    """Covariance (k, 2, 2) of centres, by whichever tells more: smooth noise alone, or white noise and structure.
+
+    Few pixels cannot tell a smooth kernel's noise from a streak; each of the two explains all that is seen.
+
+    Args:
+        response: (3, k, 2, 2), see :func:`responses`.
+        smooth: sd (k,) of the noise as a smooth field.
+        rough: (k,) sd of what differs from pixel to pixel.
+        structure: (k,) variance of background structure.
+    """
+    of_smooth = (smooth * smooth)[:, None, None] * response[0]
+    of_white = (rough * rough)[:, None, None] * response[1]
+    of_white += structure[:, None, None] * response[2]
     more = of_smooth[:, 0, 0] + of_smooth[:, 1, 1] > of_white[:, 0, 0] + of_white[:, 1, 1]
     return np.asarray(np.where(more[:, None, None], of_smooth, of_white))
 

@@ -11,6 +11,7 @@ from importlib import import_module
 import numpy as np
 
 from ctreg_cli.errors import MissingScaleError
+from ctreg_cli.imaging.follow import Follower
 from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.imaging.slice import SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
@@ -52,17 +53,17 @@ def track_live(
         on_fault: told, in a sentence, what went wrong inside.
     """
     segmentation = expecting(model, segmentation)
-    tracker = Tracker(model, options)
+    tracker, follower = Tracker(model, options), Follower(segmentation)
     for place, slice_ in enumerate(slices):
         try:
-            result = track_slice(place, slice_, tracker, scale=scale, segmentation=segmentation)
+            result = track_slice(place, slice_, tracker, follower, scale=scale)
         except MissingScaleError as error:
             on_fault(str(error))
             result = failure(place, _without_spots(slice_), "no_scale")
         # the scanner does not wait: whatever breaks here is told, and the next slice starts afresh
         except Exception as error:  # noqa: BLE001
             on_fault(f"{slice_.info.source}: {type(error).__name__} inside ctreg; the frame is looked for anew")
-            tracker = Tracker(model, options)
+            tracker, follower = Tracker(model, options), Follower(segmentation)
             result = failure(place, _without_spots(slice_), "internal_error")
         yield result
 

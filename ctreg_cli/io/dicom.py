@@ -31,7 +31,7 @@ from ctreg_cli.io.dicom_header import (
 from ctreg_cli.io.dicom_layout import Layout, read_layout, read_padding, read_rescale
 from ctreg_cli.io.dicom_pixels import excess_bytes, is_lossy, locate, pixel_element
 from ctreg_cli.io.dicom_time import delayed, frame_delays_s, read_clock
-from ctreg_cli.io.image_record import ImageRecord, Kind, Pixels, SeriesKey
+from ctreg_cli.io.image_record import ImageRecord, Instant, Kind, Pixels, SeriesKey
 
 DICOM_SUFFIXES = frozenset({".dcm", ".dicom", ".dic", ".ima"})
 
@@ -104,7 +104,8 @@ def _read(path: Path, source: str, file: BinaryIO) -> list[ImageRecord] | NotAnI
         info = SliceInfo(source=source, uids=_uids(header.elements))
         if "series_instance" not in info.uids:
             series = _LOST
-        return [_with_place(ImageRecord(info=info, series=series, problem=str(error)), header)]
+        clock, instance = _place(header.elements)
+        return [ImageRecord(info=info, series=series, problem=str(error), clock=clock, instance=instance)]
 
 
 def _is_not_an_image(header: Header) -> bool:
@@ -134,43 +135,48 @@ def _uids(elements: Elements) -> dict[str, str]:
     return {name: intern(uid) for name, uid in uids.items() if uid}
 
 
-def _with_place(record: ImageRecord, header: Header) -> ImageRecord:
-    """The record with its place in the series: time and instance number."""
+def _place(elements: Elements) -> tuple[tuple[Instant | None, ...], int | None]:
+    """What says where in its series a slice belongs: time and instance number."""
     try:
-        instance = header.elements.integer("InstanceNumber")
+        instance = elements.integer("InstanceNumber")
     except HeaderProblem:
         instance = None
-    return dataclasses.replace(record, clock=read_clock(header.elements), instance=instance)
+    return read_clock(elements), instance
 
 
 def _records(path: Path, source: str, header: Header, series: SeriesKey) -> list[ImageRecord]:
     elements = header.elements
     pixel_element(header)  # of all that is missing in a file cut short, the pixels say it best
     layout = read_layout(elements)
-    info = SliceInfo(source=source, shape=(layout.rows, layout.columns), uids=_uids(elements))
-    whole = _with_place(
-        ImageRecord(
-            info=info,
-            series=series,
-            padding=read_padding(elements, layout),
-            notes=_notes(header, layout),
-        ),
-        header,
-    )
+    whole = SliceInfo(source=source, shape=(layout.rows, layout.columns), uids=_uids(elements))
+    padding, notes = read_padding(elements, layout), _notes(header, layout)
+    clock, instance = _place(elements)
     pixels = locate(path, header, layout)
     shared = elements.items("SharedFunctionalGroupsSequence")
     own = elements.items("PerFrameFunctionalGroupsSequence")
-    if shared or own:
-        return _enhanced_frames(whole, elements, layout, pixels, shared, own)
-    slope, intercept = read_rescale(elements, layout)
-    info = _with_geometry(info, elements, elements, elements)
-    record = dataclasses.replace(whole, info=info, pixels=pixels[0], slope=slope, intercept=intercept)
+    is_enhanced = bool(shared or own)
+    slope, intercept = (1.0, 0.0) if is_enhanced else read_rescale(elements, layout)
+    record = ImageRecord(
+        info=whole if is_enhanced else _with_geometry(whole, elements, elements, elements),
+        series=series,
+        pixels=pixels[0],
+        slope=slope,
+        intercept=intercept,
+        padding=padding,
+        clock=clock,
+        instance=instance,
+        notes=notes,
+    )
+    if is_enhanced:
+        return _enhanced_frames(record, elements, layout, pixels, shared, own)
     return [record] if layout.n_frames == 1 else _classic_frames(record, elements, pixels)
 
 
 def _with_geometry(info: SliceInfo, measures: Elements, position: Elements, orientation: Elements) -> SliceInfo:
-    return dataclasses.replace(
-        info,
+    return SliceInfo(
+        source=info.source,
+        shape=info.shape,
+        uids=info.uids,
         scale=read_scale(measures),
         thickness_mm=read_thickness(measures),
         T_patient_slice=read_patient_from_slice(position, orientation),
@@ -245,7 +251,7 @@ def _enhanced_frames(
                 clock=read_clock(elements, macros.get("FrameContentSequence", nothing)),
             )
         except HeaderProblem as error:
-            frame = dataclasses.replace(whole, info=info, frame=number, problem=str(error))
+            frame = dataclasses.replace(whole, info=info, frame=number, pixels=None, problem=str(error))
         frames.append(frame)
     return frames
 

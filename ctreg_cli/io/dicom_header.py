@@ -1,7 +1,8 @@
 """The header of one DICOM file: found, bounded, and read field by field with every fault named by its tag.
 
-pydicom walks the elements; the few values needed are decoded here from their raw bytes, so that a wrong number is an
-error that names its tag (never a warning, never a quotation of the file), and the other hundred elements cost nothing.
+pydicom walks the elements, or :mod:`.dicom_plain` where a file is plain; the few values needed are decoded here from
+their raw bytes, so that a wrong number is an error that names its tag (never a warning, never a quotation of the file),
+and the other hundred elements cost nothing.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +24,8 @@ from pydicom.filereader import data_element_generator
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
 from pydicom.valuerep import VR
 from pydicom.values import convert_SQ
+
+from ctreg_cli.io.dicom_plain import HEAD_BYTES, PlainHeader, read_plain
 
 #: what is read of a header, top level; all else is stepped over
 _TOP_LEVEL = (
@@ -46,7 +50,7 @@ _NESTED = (
     *("PixelData", "FloatPixelData", "DoubleFloatPixelData"),
 )
 _TAG: dict[str, int] = {keyword: int(tag_for_keyword(keyword) or 0) for keyword in (*_TOP_LEVEL, *_NESTED)}
-_TOP_LEVEL_TAGS = [_TAG[keyword] for keyword in _TOP_LEVEL]
+_TOP_LEVEL_TAGS = dict.fromkeys(_TAG[keyword] for keyword in _TOP_LEVEL)
 _PIXEL_TAGS = {_TAG[keyword]: keyword for keyword in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")}
 
 PREAMBLE_BYTES = 128
@@ -124,12 +128,12 @@ class Elements:
         if vr in _BINARY:
             numbers: tuple[float, ...] = self._unpack(keyword, value, _BINARY[vr])
         else:
-            parts = [part.strip(b" \0") for part in value.split(b"\\")]
-            if not any(parts):
-                return None
-            if not all(_DECIMAL.fullmatch(part) for part in parts):
+            decimals = (_repeated_decimals if len(value) <= MAX_REPEATED_BYTES else _text_decimals)(value)
+            if decimals is None:
                 raise problem(keyword, "is not a decimal number")
-            numbers = tuple(map(float, parts))
+            if not decimals:
+                return None
+            numbers = decimals
         if not all(map(math.isfinite, numbers)):
             raise problem(keyword, "is not finite")
         if count is not None and len(numbers) != count:
@@ -192,6 +196,18 @@ class Elements:
         return struct.unpack(f"{'<' if self.little_endian else '>'}{len(value) // size}{code}", value)
 
 
+def _text_decimals(value: bytes) -> tuple[float, ...] | None:
+    """Decimal numbers as text, none where all are blank; None where something else is among them."""
+    parts = [part.strip(b" \0") for part in value.split(b"\\")]
+    if not any(parts):
+        return ()
+    return tuple(map(float, parts)) if all(map(_DECIMAL.fullmatch, parts)) else None
+
+
+#: a series repeats most of its numbers in every slice
+MAX_REPEATED_BYTES = 128
+_repeated_decimals = lru_cache(maxsize=256)(_text_decimals)
+
 #: integers that implicit VR stores as text
 _IS_TEXT = {keyword: keyword in ("InstanceNumber", "NumberOfFrames") for keyword in _TAG}
 
@@ -246,7 +262,12 @@ def read_header(file: BinaryIO, size: int) -> Header:
         HeaderProblem: not a DICOM file, or one that cannot be walked through.
     """
     notes: list[str] = []
-    head = file.read(PREAMBLE_BYTES + 4)
+    head = file.read(HEAD_BYTES)
+    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    if plain is not None:
+        return _as_header(plain, size)
+    head = head[: PREAMBLE_BYTES + 4]
+    file.seek(len(head))
     if head[PREAMBLE_BYTES:] != MAGIC:
         if not _is_bare(head):
             raise HeaderProblem("the file is not DICOM (no DICM mark at byte 128)")
@@ -284,6 +305,25 @@ def read_header(file: BinaryIO, size: int) -> Header:
         size=size,
         more=more,
         notes=tuple(notes),
+    )
+
+
+def _as_header(plain: PlainHeader, size: int) -> Header:
+    return Header(
+        elements=Elements(plain.elements, True),
+        meta=Elements(plain.meta, True),
+        transfer_syntax=plain.transfer_syntax,
+        implicit_vr=plain.transfer_syntax == ImplicitVRLittleEndian,
+        pixels=PixelElement(
+            keyword=_PIXEL_TAGS[plain.pixel_tag],
+            vr=plain.pixel_vr,
+            length=plain.pixel_length,
+            offset=plain.pixel_offset,
+        ),
+        deflated_from=None,
+        size=size,
+        more=False,
+        notes=(),
     )
 
 
@@ -328,7 +368,7 @@ def _walk(file: BinaryIO, implicit: bool, little: bool) -> tuple[dict[int, Any],
         found.append(PixelElement(keyword=_PIXEL_TAGS[tag], vr=vr, length=length_or_none, offset=file.tell()))
         return True
 
-    walk = data_element_generator(file, implicit, little, stop_when=at_pixels, specific_tags=_TOP_LEVEL_TAGS)
+    walk = data_element_generator(file, implicit, little, stop_when=at_pixels, specific_tags=[*_TOP_LEVEL_TAGS])
     return _whole(walk), found[0] if found else None
 
 

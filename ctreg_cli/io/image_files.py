@@ -42,14 +42,15 @@ def files_in(path: Path, skipped: Counter[str]) -> Iterator[tuple[Path, str]]:
     if not path.is_dir():
         yield path, printable(path.name)
         return
-    files = [Path(folder) / name for folder, _, names in os.walk(path, onerror=cannot_open) for name in names]
-    by_name = sorted((natural_key(relative), relative, file) for file in files for relative in [_relative(file, path)])
-    for _, relative, file in by_name:
+    by_name = []
+    for folder, _, names in os.walk(path, onerror=cannot_open):
+        place = Path(folder)
+        within = "" if place == path else f"{place.relative_to(path).as_posix()}/"
+        for name in names:
+            relative = printable(within + name)
+            by_name.append((natural_key(relative), relative, place / name))
+    for _, relative, file in sorted(by_name):
         yield file, relative
-
-
-def _relative(file: Path, folder: Path) -> str:
-    return printable(file.relative_to(folder).as_posix())
 
 
 def printable(name: str) -> str:

@@ -51,7 +51,7 @@ def test_a_part_of_the_spots_has_their_rows() -> None:
 def test_only_long_spots_are_turned_and_turned_back() -> None:
     angle = 0.4
     turn = np.array([[[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]])
-    long = LongSpots(mask=np.array([False, True]), index=np.array([1]), turn=turn)
+    long = LongSpots(mask=np.array([False, True]), index=np.array([1]), rotation=np.stack([np.eye(2), turn[0]]))
     vectors = np.array([[1.0, np.cos(angle)], [2.0, np.sin(angle)]])
     turned = long.turned(vectors)
     np.testing.assert_allclose(turned, [[1.0, 1.0], [2.0, 0.0]], atol=1e-12)

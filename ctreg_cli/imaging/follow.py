@@ -1,0 +1,583 @@
+"""Spots of slice after slice: where a rod's spot is alone and looks as it did, one step of the fit is all it takes.
+
+The centre always comes from the pixels of the slice at hand. What is kept from slice to slice is what the fit starts
+from (:mod:`.profile`: height, shape, background) and the weights of its pixels; from there one Gauss–Newton step ends
+within a small part of the noise of where the full fit ends. Its covariance follows the law of :mod:`.localisation`:
+structure about the spot is looked for in every slice, the noise is measured every few. Whatever is not plainly what it
+was is measured as in :func:`.segmentation.measure_spots`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.imaging.blob import (
+    LONE_SHARES,
+    LONE_SPREADS,
+    Blobs,
+    axes_of,
+    measure_lone_blobs,
+    moments_of,
+    monomials,
+)
+from ctreg_cli.imaging.fit import FLATNESS_RANGE, LONG_FLATNESS_PRIOR, PRIOR
+from ctreg_cli.imaging.localisation import (
+    NEAR_PX,
+    NOISE_BEYOND_PX,
+    START_LEVEL,
+    START_LOG_BETA,
+    Law,
+    Profiles,
+    centre_columns,
+    centre_law,
+    distance_beyond_edge,
+    fit_profiles,
+    root_pixel_weights,
+    structure_near,
+)
+from ctreg_cli.imaging.plateau import LONG_RATIO, LongSpots
+from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
+from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, measure_spots
+from ctreg_cli.imaging.slice import Slice
+from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.imaging.window import UprightImage, disc, grid
+
+#: radius of the windows, px: the least of those that the search tries
+RADIUS_PX = 8
+#: steps at most; the last must have moved the contours by less than this (in half widths) and changed height, shape and
+#: flatness by less than this (in ln)
+MAX_STEPS, LAST_STEP, LAST_STEP_LN = 3, 0.06, 0.12
+#: height and shape change by about so much (in ln) from slice to slice: where a spot is cut off, its pixels tell little
+#: of its height, and what they tell shall not throw the fit about; the centre is not touched by any of that
+SLICE_TO_SLICE_LN = 0.1
+#: length and thickness are remembered over about so many slices; a spot for which one is this many times what it was is
+#: not the same any more, nor one that became long, or is not any more, beyond doubt
+AXES_MEMORY, MAX_CHANGE, LONG_DOUBT = 4.0, 1.5, 1.15
+#: mean squares of residuals beyond so many times what they were are something new in the window
+MAX_MISFIT = 3.0
+#: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
+#: changes by this factor, or the flatness of a long spot by so much; structure about a spot is looked at in every slice
+LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 32, 1.7, 0.15
+#: everything is measured in full again after so many slices
+MAX_AGE = 64
+#: after a spot could not be learned, that is not tried for so many slices, twice as many each time
+FIRST_WAIT, MAX_WAIT = 1, 64
+
+
+def _prior() -> FloatArray:
+    """(10,): inverse variances of the steps from slice to slice; flatness has one of its own beside."""
+    prior = PRIOR[:, 0].copy()
+    prior[LOG_HEIGHT] = prior[SHAPE] = prior[FLATNESS] = SLICE_TO_SLICE_LN**-2
+    return prior
+
+
+def _last_step() -> FloatArray:
+    """(10, 1): what the last step must not exceed; background and its gradient may do as they like."""
+    limit = np.full((N_PARAMETERS, 1), np.inf)
+    limit[CENTRE], limit[LOG_HEIGHT], limit[SHAPE], limit[FLATNESS] = LAST_STEP, *(3 * [LAST_STEP_LN])
+    return limit
+
+
+_PRIOR_MATRIX, _LAST_STEP = np.diag(_prior()), _last_step()
+
+
+class Follower:
+    """Measures the spots of one frame in slice after slice; one a sequence, not thread-safe."""
+
+    def __init__(self, options: SegmentationOptions = DEFAULT_OPTIONS) -> None:
+        self.options = options
+        self._known: _Known | None = None
+        #: slices since anything was measured in full, and since the law of the centres was measured
+        self._age = self._law_age = 0
+        #: of rods whose spots could not be learned: slices to go until that is tried again, and how many there were
+        self._waits: dict[int, tuple[int, int]] = {}
+
+    def forget(self) -> None:
+        """All spots are measured in full in the next slice."""
+        self._known = None
+
+    def measure(self, slice_: Slice, rods: IntArray, uv_px: FloatArray, radius_px: FloatArray) -> Spots:
+        """Spots within ``radius_px`` (k,) of where the spots of ``rods`` are expected, ``uv_px`` (k, 2).
+
+        What is returned is what :func:`~ctreg_cli.imaging.segmentation.measure_spots` returns, but for a small part of
+        the noise, and for the order of the spots.
+
+        Args:
+            slice_: the image.
+            rods: (k,) numbers that tell the rods apart, rising.
+            uv_px: centres predicted, px.
+            radius_px: how far off they may be, px.
+        """
+        known, self._known = self._known, None  # what is not found again is not known any more
+        self._age += 1
+        if known is None or self._age > MAX_AGE or not _is_plain(slice_, self.options):
+            return self._measured_in_full(slice_, rods, uv_px, radius_px)
+        if len(rods) == len(known.rods) and (rods == known.rods).all():
+            seen, found = self._follow(slice_, known, uv_px, radius_px)
+            if found.all():
+                return seen
+            rest = ~found
+        else:
+            here = np.isin(rods, known.rods)
+            if not here.any():
+                return self._measured_in_full(slice_, rods, uv_px, radius_px)
+            known = known.take(np.isin(known.rods, rods))
+            seen, found = self._follow(slice_, known, uv_px[here], radius_px[here])
+            rest = ~here
+            rest[here] = ~found
+        others = self._measured_in_full(slice_, rods[rest], uv_px[rest], radius_px[rest])
+        return _together(seen, others, self.options)
+
+    def _measured_in_full(self, slice_: Slice, rods: IntArray, uv: FloatArray, radius: FloatArray) -> Spots:
+        """Spots of rods of which nothing is known; how they look is remembered where one is alone and expected."""
+        spots = measure_spots(slice_, uv, radius, self.options)
+        if not len(spots) or not _is_plain(slice_, self.options):
+            return spots
+        if self._known is None:
+            self._age = 0
+        distance = np.hypot(*(uv[:, None] - spots.uv_px).transpose(2, 0, 1))
+        due = (np.count_nonzero(distance <= radius[:, None], axis=1) == 1) & np.array([*map(self._is_due, rods)])
+        if due.any():
+            image = UprightImage.of(slice_, bright=self.options.polarity == "bright")
+            middles = np.rint(spots.uv_px[distance[due].argmin(axis=1)]).astype(np.intp)
+            blobs, lone = measure_lone_blobs(image, middles, RADIUS_PX)
+            learned = rods[due][lone]
+            self._waits |= dict.fromkeys(learned.tolist(), (0, 0))
+            if len(learned):
+                blobs = blobs.take(lone)
+                known = _Known.of(learned, blobs, fit_profiles(blobs, image.ceiling))
+                self._known = known if self._known is None else self._known.joined(known)
+        return spots
+
+    def _is_due(self, rod: int) -> bool:
+        """Whether to try and learn how the spot of a rod looks; the next try, should it fail, comes later and later."""
+        left, waited = self._waits.get(rod, (0, 0))
+        if left > 0:
+            self._waits[rod] = left - 1, waited
+            return False
+        waited = min(max(2 * waited, FIRST_WAIT), MAX_WAIT)
+        self._waits[rod] = waited, waited
+        return True
+
+    def _follow(self, slice_: Slice, known: _Known, uv: FloatArray, radius: FloatArray) -> tuple[Spots, BoolArray]:
+        """Spots of those known rods (k,) that a step from what is known measures, and which rods these are."""
+        windows = _Windows.of(slice_, bright=self.options.polarity == "bright")
+        middles, values, brightest, good = windows.about(uv, known)
+        region = _Region.of(values > known.half[:, None])
+        fitted, shift, close = _stepped(known, region, values, brightest)
+        looks = _Looks.of(fitted)
+
+        good &= close & looks.are_those_of(known, self.options) & region.is_that_of(known)
+        centre = middles + fitted.centre.T
+        off = _length(centre - uv)
+        good &= off <= radius
+        good &= (_length(centre[:, None] - centre) <= RADIUS_PX).sum(axis=1) == 1  # each is near itself
+        beyond = off + radius > RADIUS_PX
+        if beyond.any():  # the windows do not show all that was to be looked at
+            level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
+            good[beyond] &= windows.nothing_else(centre[beyond], uv[beyond], radius[beyond], level[beyond])
+
+        formal = _formal_variance(fitted.parameters, shift)
+        self._law_age += 1
+        if self._law_age > LAW_EVERY or (good & looks.have_changed(known, fitted)).any():
+            self._law_age = 0
+            known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
+        structure = structure_near(fitted, known.law.rough, RADIUS_PX)
+        covariance = known.law.covariance(structure, formal / known.formal)
+        good &= np.isfinite(covariance[:, 0, 0] + covariance[:, 1, 1])
+        spots = Spots(
+            uv_px=centre,
+            covariance_px=covariance,
+            area_px=region.area,
+            contrast=fitted.height * windows.unit,
+            major_px=region.axes[0],
+            minor_px=region.axes[1],
+            angle_rad=region.angle,
+        )
+        known.seen(fitted, region)
+        if good.all():
+            self._known = known
+            return spots, good
+        if good.any():
+            self._known = known.take(good)
+        return spots.take(good), good
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Known:
+    """How the spots of ``k`` rods looked in the last slice."""
+
+    #: (k,) rising
+    rods: IntArray
+    #: (10, k)
+    parameters: FloatArray
+    #: which are long, and coordinates (2, p) or (2, k, p) of the pixels of a window as the spots see them
+    long: LongSpots
+    coordinates: FloatArray
+    #: (k,) mean and inverse variance of what flatness may be
+    flatness: FloatArray
+    flatness_prior: FloatArray
+    #: (2, k) length and thickness, px
+    axes: FloatArray
+    #: (k,) what lies above this value is the spot and nothing else; and half of its height
+    level: FloatArray
+    half: FloatArray
+    #: (k,) what pixels are weighted by, as in :class:`~ctreg_cli.imaging.localisation.Profiles`
+    noise: FloatArray
+    structure_slope: FloatArray
+    #: value at which the image is cut off
+    ceiling: float
+    #: of the centres, measured some slices ago; from then are the variances (k,) that the profiles alone made, how
+    #: large residuals were (:class:`_Looks`), and the flatness
+    law: Law
+    formal: FloatArray
+    misfit: FloatArray
+    beside: FloatArray
+    flatness_then: FloatArray
+
+    @classmethod
+    def of(cls, rods: IntArray, blobs: Blobs, fitted: Profiles) -> _Known:
+        """Of profiles fitted in full."""
+        shift, looks, long = centre_columns(fitted.normal), _Looks.of(fitted), fitted.long
+        background, height, flatness = fitted.parameters[BACKGROUND], fitted.height, fitted.parameters[FLATNESS]
+        return cls(
+            rods=rods,
+            parameters=fitted.parameters,
+            long=long,
+            coordinates=_coordinates_of(long),
+            flatness=np.where(long.mask, flatness, START_LOG_BETA),
+            flatness_prior=np.where(long.mask, LONG_FLATNESS_PRIOR, PRIOR[FLATNESS]),
+            axes=np.stack(blobs.axes[:2]),
+            level=background + START_LEVEL * height,
+            half=background + 0.5 * height,
+            noise=fitted.noise,
+            structure_slope=fitted.structure_slope,
+            ceiling=fitted.ceiling,
+            law=centre_law(fitted, shift, RADIUS_PX),
+            formal=_formal_variance(fitted.parameters, shift),
+            misfit=looks.misfit,
+            beside=looks.beside,
+            flatness_then=flatness,
+        )
+
+    def most_beside(self, height: FloatArray) -> FloatArray:
+        """How far (k,) anything may stand out beside spots so high (k,); see :mod:`.blob`."""
+        least, most = LONE_SHARES
+        limit: FloatArray = np.minimum(np.maximum(LONE_SPREADS * self.law.rough, least * height), most * height)
+        return limit
+
+    def measured(self, law: Law, formal: FloatArray, looks: _Looks, fitted: Profiles) -> None:
+        """Remember the law, and what it was measured with."""
+        self.law, self.formal, self.misfit, self.beside = law, formal, looks.misfit, looks.beside
+        self.flatness_then = fitted.parameters[FLATNESS]
+
+    def seen(self, fitted: Profiles, region: _Region) -> None:
+        """Remember how the spots look now."""
+        background = fitted.parameters[BACKGROUND]
+        self.parameters, self.ceiling = fitted.parameters, fitted.ceiling
+        self.level = background + START_LEVEL * fitted.height
+        self.half = background + 0.5 * fitted.height
+        self.axes = self.axes + (region.axes - self.axes) / AXES_MEMORY
+
+    def take(self, which: BoolArray | IntArray) -> _Known:
+        """Some of the rods."""
+        long = self.long.take(which)
+        return _Known(
+            rods=self.rods[which],
+            long=long,
+            coordinates=_coordinates_of(long),
+            ceiling=self.ceiling,
+            law=self.law.take(which),
+            **{name: getattr(self, name)[..., which] for name in _OF_EACH},
+        )
+
+    def joined(self, other: _Known) -> _Known:
+        """These rods and others."""
+        rods, long = np.concatenate([self.rods, other.rods]), self.long.joined(other.long)
+        return _Known(
+            rods=rods,
+            long=long,
+            coordinates=_coordinates_of(long),
+            ceiling=max(self.ceiling, other.ceiling),
+            law=self.law.joined(other.law),
+            **{name: np.concatenate([getattr(self, name), getattr(other, name)], axis=-1) for name in _OF_EACH},
+        ).take(np.argsort(rods))
+
+
+#: arrays of a :class:`_Known` whose last axis counts the rods
+_OF_EACH = (
+    *("parameters", "flatness", "flatness_prior", "axes", "level", "half", "noise", "structure_slope"),
+    *("formal", "misfit", "beside", "flatness_then"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Region:
+    """What of ``k`` windows lies above half height."""
+
+    own: BoolArray
+    #: (k,) px², (k, 2) and (k, 2, 2), see :func:`ctreg_cli.imaging.blob.moments_of`
+    area: FloatArray
+    middle: FloatArray
+    moments: FloatArray
+    #: (2, k) long and short axis, px; and the angle (k,) of the long one, rad
+    axes: FloatArray
+    angle: FloatArray
+
+    @classmethod
+    def of(cls, own: BoolArray) -> _Region:
+        area, middle, moments = moments_of(own, _monomials())
+        long, thick, angle = axes_of(moments)
+        return cls(own=own, area=area, middle=middle, moments=moments, axes=np.array([long, thick]), angle=angle)
+
+    def is_that_of(self, known: _Known) -> BoolArray:
+        """Whether (k,) a spot is as long and thick as it was, and has not become long or round."""
+        change, (long, thick) = self.axes / known.axes, known.axes
+        same = ((change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)).all(axis=0)
+        doubt = np.where(known.long.mask, 1.0 / LONG_DOUBT, LONG_DOUBT) * LONG_RATIO
+        same &= (long > doubt * thick) == known.long.mask
+        return np.asarray(same)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Looks:
+    """What fits left: mean squares (k,) of the weighted residuals, and the greatest residual (k,) beside each spot."""
+
+    height: FloatArray
+    misfit: FloatArray
+    beside: FloatArray
+
+    @classmethod
+    def of(cls, fitted: Profiles) -> _Looks:
+        weighted = fitted.rows.by_spot[:, -1]
+        return cls(
+            height=fitted.height,
+            misfit=(weighted * weighted).sum(axis=1) / weighted.shape[1],
+            beside=np.where(fitted.quiet, fitted.residuals, -np.inf).max(axis=1),
+        )
+
+    def are_those_of(self, known: _Known, options: SegmentationOptions) -> BoolArray:
+        """Whether (k,) nothing has come up in a spot or beside it."""
+        same = self.misfit < MAX_MISFIT * known.misfit
+        same &= self.beside < known.beside + known.most_beside(self.height)
+        same &= self.height > options.min_contrast_sd * known.law.rough
+        return np.asarray(same)
+
+    def have_changed(self, known: _Known, fitted: Profiles) -> BoolArray:
+        """Whether (k,) things are no longer what they were when the law was measured."""
+        change = self.misfit / known.misfit
+        changed = (change > LAW_CHANGE) | (change < 1.0 / LAW_CHANGE)
+        flatter = np.abs(fitted.parameters[FLATNESS] - known.flatness_then) > LAW_FLATNESS
+        return np.asarray(changed | (known.long.mask & flatter))
+
+
+def _stepped(
+    known: _Known, region: _Region, values: FloatArray, brightest: FloatArray
+) -> tuple[Profiles, FloatArray, BoolArray]:
+    """Profiles a Gauss–Newton step or a few from what is known, and whether (k,) they can be relied on.
+
+    Between these: the first two columns (k, 10, 2) of the inverses of the normal matrices. The rows of the profiles
+    hold the derivatives before the last step, and the residuals after it as those tell them.
+
+    Args:
+        known: where the fit starts from.
+        region: what lies above half height.
+        values: (k, p) windows.
+        brightest: (2, k) centres of gravity to start from.
+    """
+    u, v, _ = _coordinates()
+    distance = distance_beyond_edge(region.moments, u - region.middle[:, :1], v - region.middle[:, 1:])
+    root_weights = root_pixel_weights(distance, known.noise, known.structure_slope)
+    ceiling = max(known.ceiling, float(values.max()))
+    clipped = values >= ceiling
+    n_clipped = (clipped & region.own).sum(axis=1)
+    long = known.long if len(known.long) else None
+    along, across = known.coordinates
+    rows = Rows(
+        along, across, values, clipped if n_clipped.any() else None, root_weights, None if long is None else long.mask
+    )
+    parameters = known.parameters.copy()
+    parameters[CENTRE] = brightest if long is None else long.turned(brightest)
+
+    columns = np.zeros((len(values), N_PARAMETERS, 3))
+    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
+    for n_left in reversed(range(MAX_STEPS)):
+        products = rows.evaluate(parameters)
+        normal = products[:, :-1, :-1] + _PRIOR_MATRIX
+        normal[:, FLATNESS, FLATNESS] += known.flatness_prior
+        columns[:, :, 2] = products[:, :-1, -1]
+        columns[:, FLATNESS, 2] -= known.flatness_prior * (parameters[FLATNESS] - known.flatness)
+        solved = np.asarray(np.linalg.solve(normal, columns), dtype=np.float64)
+        step = solved[:, :, 2].T
+        small = (np.abs(step) < _LAST_STEP).all(axis=0)
+        parameters = moved(parameters, step)
+        if not n_left or small.all():
+            break
+    rows.by_spot[:, -1] -= (step.T[:, None] @ rows.by_spot[:, :-1])[:, 0]
+    low, high = FLATNESS_RANGE
+    small &= (parameters[FLATNESS] >= low) & (parameters[FLATNESS] <= high)
+    fitted = Profiles(
+        parameters=parameters,
+        long=known.long,
+        centre=parameters[CENTRE] if long is None else long.turned_back(parameters[CENTRE]),
+        normal=normal,
+        rows=rows,
+        residuals=rows.by_spot[:, -1] / root_weights,
+        noise=known.noise,
+        structure_slope=known.structure_slope,
+        near=(distance > NEAR_PX[0]) & (distance < NEAR_PX[1]),
+        quiet=distance > NOISE_BEYOND_PX,
+        height=np.minimum(np.exp(parameters[LOG_HEIGHT]), np.maximum(ceiling - parameters[BACKGROUND], 1.0)),
+        n_clipped=n_clipped,
+        ceiling=ceiling,
+    )
+    return fitted, solved[:, :, :2], np.asarray(small)
+
+
+def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:
+    """(k,) of the centre along u and v together, were the weights all that is known of the noise."""
+    l0, _, l2 = parameters[SHAPE]
+    return np.asarray(shift[:, 0, 0] * np.exp(-2.0 * l0) + shift[:, 1, 1] * np.exp(-2.0 * l2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Windows:
+    """The pixels of a slice, spots upright; only integers, so that each is a value."""
+
+    #: the image in one line
+    stored: NDArray[Any]
+    shape: tuple[int, int]
+    sign: float
+    unit: float
+    #: range of upright values that are no image
+    padding: tuple[float, float] | None
+
+    @classmethod
+    def of(cls, slice_: Slice, *, bright: bool) -> _Windows:
+        sign = math.copysign(1.0, slice_.slope) * (1.0 if bright else -1.0)
+        padding = slice_.padding
+        if padding is not None and sign < 0:
+            padding = -padding[1], -padding[0]
+        return cls(
+            stored=slice_.stored.reshape(-1),
+            shape=slice_.stored.shape,
+            sign=sign,
+            unit=abs(slice_.slope),
+            padding=padding,
+        )
+
+    def about(self, uv: FloatArray, known: _Known) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Windows about the centres of gravity of what is bright near ``uv`` (k, 2).
+
+        Returns:
+            Middle pixels (k, 2), upright values (k, p) on discs about them, those centres (2, k) from the middles, and
+            which discs show nothing but image.
+        """
+        first = np.rint(uv)
+        weights = self._at(first, RADIUS_PX)
+        weights -= known.level[:, None]
+        np.maximum(weights, 0.0, out=weights)
+        sums = weights @ _coordinates()[2]
+        centre = first + sums[:, :2] / np.maximum(sums[:, 2:], 1e-9)
+        middles = np.rint(centre)
+        values, good = self._at(middles, RADIUS_PX), self._inside(middles, RADIUS_PX)
+        if self._may_be_padding(values):
+            good &= ~self._is_padding(values).any(axis=1)
+        return middles, values, (centre - middles).T, good
+
+    def nothing_else(self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray) -> BoolArray:
+        """Whether nothing within ``radius`` (k,) of ``uv`` (k, 2) is above a ``level`` (k,) but the spots themselves.
+
+        Those are what lies in the windows about their ``centre`` (k, 2), which have been looked at.
+        """
+        reach = math.ceil(float(radius.max()))
+        middles = np.rint(uv)
+        values = self._at(middles, reach)
+        u, v = (axis.ravel()[disc(reach)] for axis in grid(reach))
+        from_uv, from_centre = uv - middles, centre - middles
+        looked_at = (u - from_uv[:, :1]) ** 2 + (v - from_uv[:, 1:]) ** 2 <= (radius * radius)[:, None]
+        looked_at &= (u - from_centre[:, :1]) ** 2 + (v - from_centre[:, 1:]) ** 2 > (RADIUS_PX - 1.0) ** 2
+        if self._may_be_padding(values):
+            looked_at &= ~self._is_padding(values)
+        return self._inside(middles, reach) & ~(looked_at & (values > level[:, None])).any(axis=1)
+
+    def _inside(self, middles: FloatArray, radius: int) -> BoolArray:
+        """Which (k,) windows about ``middles`` (k, 2) lie in the image."""
+        rows, columns = self.shape
+        u, v = middles.T
+        return np.asarray((np.minimum(u, v) >= radius) & (u < columns - radius) & (v < rows - radius))
+
+    def _at(self, middles: FloatArray, radius: int) -> FloatArray:
+        """Upright values (k, p) on discs about whole pixels (k, 2); beyond the image they mean nothing."""
+        columns = self.shape[1]
+        at = (middles[:, 1] * columns + middles[:, 0]).astype(np.intp)
+        values: FloatArray = self.stored.take(at[:, None] + _offsets(radius, columns), mode="clip") * self.sign
+        return values
+
+    def _may_be_padding(self, values: FloatArray) -> bool:
+        return self.padding is not None and self.padding[1] >= values.min() and self.padding[0] <= values.max()
+
+    def _is_padding(self, values: FloatArray) -> BoolArray:
+        assert self.padding is not None
+        return np.asarray((values >= self.padding[0]) & (values <= self.padding[1]))
+
+
+def _is_plain(slice_: Slice, options: SegmentationOptions) -> bool:
+    """Whether windows of a slice can be taken by one index, and mean one thing."""
+    stored = slice_.stored
+    return (
+        options.polarity != "auto"
+        and stored.dtype.kind in "iu"
+        and stored.flags.c_contiguous
+        and min(stored.shape) > 2 * RADIUS_PX
+    )
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    """Of vectors (..., 2)."""
+    squared = vectors * vectors
+    return np.asarray(np.sqrt(squared[..., 0] + squared[..., 1]))
+
+
+def _together(seen: Spots, others: Spots, options: SegmentationOptions) -> Spots:
+    """All spots, the others without those seen already, and all without what is too faint beside the strongest."""
+    if len(others) and len(seen):
+        apart = np.hypot(*(others.uv_px[:, None] - seen.uv_px).transpose(2, 0, 1)).min(axis=1)
+        others = others.take(apart > 0.5 * others.minor_px)
+    spots = seen.joined(others)
+    strong = spots.contrast >= options.min_relative_contrast * spots.contrast.max(initial=0.0)
+    return spots if strong.all() else spots.take(strong)
+
+
+@cache
+def _coordinates() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """u and v (p,) of the pixels of a window's disc, and these and 1 as columns (p, 3)."""
+    at = disc(RADIUS_PX)
+    u, v = (axis.ravel()[at] for axis in grid(RADIUS_PX))
+    return frozen(u, u.shape), frozen(v, v.shape), frozen(np.stack([u, v, np.ones(len(u))], axis=1), (len(u), 3))
+
+
+def _coordinates_of(long: LongSpots) -> FloatArray:
+    """(2, p), or (2, k, p) where some spots are long: of the pixels of a window's disc, as the spots see them."""
+    u, v, _ = _coordinates()
+    return long.coordinates(u, v) if len(long) else np.stack([u, v])
+
+
+@cache
+def _monomials() -> FloatArray:
+    """(p, 7) rows of :func:`ctreg_cli.imaging.blob.monomials` at the pixels of a window's disc."""
+    return monomials(RADIUS_PX)[disc(RADIUS_PX)]
+
+
+@lru_cache(maxsize=16)
+def _offsets(radius: int, columns: int) -> IntArray:
+    """(p,) from a window's middle pixel to those of its disc, in an image in one line."""
+    u, v = (axis.ravel()[disc(radius)] for axis in grid(radius))
+    return frozen_index(v * columns + u)
