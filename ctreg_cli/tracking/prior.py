@@ -13,17 +13,22 @@ from typing import Protocol
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.evidence import PosePrior, log_odds
-from ctreg_cli.registration.matching import Matches, Scene
-from ctreg_cli.registration.refine import covariance_from_information
+from ctreg_cli.registration.matching import Matches, Scene, observations
+from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
+from ctreg_cli.tracking.single import difference, log_determinant, solve_positive
 
 #: probability that the frame is moved by hand from one slice to the next, or within a second; the most it may become
 JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5
 #: side of the field a frame may lie in, in its own sizes
 _FIELD_SIZES = 3.0
+#: a jump to where a match puts the frame is out of the question when it lies this far (ln) under the best match
+_OUT_OF_THE_QUESTION = 10.0
+#: steps to the pose most probable with the past; the last of them, in sd², must be less than this
+_MAP_STEPS, _MAP_DONE2 = 7, 1e-2
 
 
 class Predicted(Protocol):
@@ -67,15 +72,19 @@ class PastPrior:
 
     def log_density(self, T: FloatArray, covariance: FloatArray) -> float:
         """ln π, per mm³ rad³, of a pose (4, 4) measured with ``covariance`` (6, 6), which it is averaged over."""
-        innovation = poses.difference(T, self.T)
+        innovation = difference(T, self.T)
         S = self.covariance + covariance
-        _, logdet = np.linalg.slogdet(S)
-        near = -0.5 * (float(innovation @ np.linalg.solve(S, innovation)) + logdet) - 3 * math.log(2 * math.pi)
-        far = float(self.anywhere.log_density(T[None, :3, :3])[0]) - math.log(self.volume_mm3)
-        return float(np.logaddexp(math.log1p(-self.p_jump) + near, math.log(self.p_jump) + far))
+        distance2 = float(innovation @ solve_positive(S, innovation))
+        near = -0.5 * (distance2 + log_determinant(S)) - 3 * math.log(2 * math.pi)
+        return float(np.logaddexp(math.log1p(-self.p_jump) + near, self.log_jumped(T)))
 
-    def applied(self, model: RodModel, scene: Scene, matches: Matches) -> Matches:
-        """Matches weighed anew with this prior, best first."""
+    def log_jumped(self, T: FloatArray) -> float:
+        """ln of the part of π, per mm³ rad³, that is left to a pose (4, 4) after a jump."""
+        anywhere = float(self.anywhere.log_density(T[None, :3, :3])[0]) - math.log(self.volume_mm3)
+        return math.log(self.p_jump) + anywhere
+
+    def applied(self, model: RodModel, scene: Scene, matches: Matches) -> Weighed:
+        """Matches weighed anew with this prior, best first, and where the frame then is if each of them is true."""
         H, _ = matches.fit.normal_equations()
         C, _ = covariance_from_information(H, model.size_mm)
         density = np.array([self.log_density(T, c) for T, c in zip(matches.T, C, strict=True)])
@@ -89,7 +98,77 @@ class PastPrior:
             matches.expected,
             log_prior_density=density,
         )
+        jumped = odds - density + np.array([self.log_jumped(T) for T in matches.T])
+        T_near, C_near, settled = most_probable(
+            model, observations(scene, matches.spot_of_rod), self.T, self.covariance
+        )
+        # where a jump is not out of the question, only what the spots say counts
+        near = settled & (jumped < odds.max() - _OUT_OF_THE_QUESTION)
+        order = np.argsort(-odds, kind="stable")
         weighed = Matches(
             T=matches.T, spot_of_rod=matches.spot_of_rod, log_odds=odds, fit=matches.fit, expected=matches.expected
         )
-        return weighed.subset(np.argsort(-odds, kind="stable"))
+        return Weighed(
+            matches=weighed.subset(order),
+            covariance=C[order],
+            T_if_true=np.where(near[:, None, None], T_near, matches.T)[order],
+            covariance_if_true=np.where(near[:, None, None], C_near, C)[order],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weighed:
+    """``b`` matches, best first, and where the frame is if each of them is the true one."""
+
+    matches: Matches
+    #: (b, 6, 6) of the poses that the spots alone speak for
+    covariance: FloatArray
+    #: (b, 4, 4) the most probable pose with the past taken in, and (b, 6, 6) its covariance; that of the spots alone
+    #: where there is no past, or the frame may have jumped
+    T_if_true: FloatArray
+    covariance_if_true: FloatArray
+
+    @classmethod
+    def alone(cls, model: RodModel, matches: Matches) -> Weighed:
+        """Matches that no past says anything of."""
+        C, _ = covariance_from_information(matches.fit.normal_equations()[0], model.size_mm)
+        return cls(matches=matches, covariance=C, T_if_true=matches.T, covariance_if_true=C)
+
+    def distance2(self, T: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(b,) how far a pose (4, 4) would be wrong, in sd² of its ``covariance`` (6, 6), if each match were true."""
+        apart = poses.difference(self.T_if_true, T)
+        return np.asarray(np.einsum("bi,ij,bj->b", apart, np.linalg.pinv(covariance, hermitian=True), apart))
+
+    def subset(self, rows: BoolArray) -> Weighed:
+        """These matches only."""
+        return Weighed(
+            matches=self.matches.subset(rows),
+            covariance=self.covariance[rows],
+            T_if_true=self.T_if_true[rows],
+            covariance_if_true=self.covariance_if_true[rows],
+        )
+
+
+def most_probable(
+    model: RodModel, seen: Observations, T_predicted: FloatArray, predicted_covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """The most probable poses (b, 4, 4) with the past taken in, their covariances (b, 6, 6), and which were found.
+
+    Args:
+        model: the rods.
+        seen: ``b`` hypotheses.
+        T_predicted: (4, 4) where the past expected the frame.
+        predicted_covariance: (6, 6) of it.
+    """
+    b = len(seen.matched)
+    P_inverse = np.linalg.inv(predicted_covariance)
+    T = np.repeat(T_predicted[None], b, axis=0)
+    size2 = np.full(b, np.inf)
+    C = np.empty((b, 6, 6))
+    for _ in range(_MAP_STEPS):
+        H, g = linearise(model, T, seen).normal_equations()
+        C = np.linalg.inv(H + P_inverse)
+        step = (C @ (g - poses.difference(T, T_predicted) @ P_inverse)[..., None])[..., 0]
+        size2 = np.einsum("bi,bij,bj->b", step, H + P_inverse, step)
+        T = poses.update(T, step)
+    return T, C, size2 < _MAP_DONE2

@@ -23,18 +23,35 @@ from ctreg_cli.design.symmetry import symmetries
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import Matches, Scene, doubt, join, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, doubt, join, observations, search, weigh
+from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
-from ctreg_cli.registration.register import LEAST_MATCHES, decide, least_matches, make_scene
+from ctreg_cli.registration.register import (
+    LEAST_MATCHES,
+    RIVAL_SD,
+    decide,
+    fit_warnings,
+    least_matches,
+    make_scene,
+    protected,
+    refined_candidates,
+)
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.gate import GATE_SD, Outlook
-from ctreg_cli.tracking.prior import PastPrior
+from ctreg_cli.tracking.prior import PastPrior, Weighed
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.settle import (
+    covering,
+    covering_reconciled,
+    hangs_on_one_spot,
+    reconciled,
+    straightened,
+)
 from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
-from ctreg_cli.tracking.variants import covering, with_other_rods, with_twins
+from ctreg_cli.tracking.variants import with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -49,6 +66,10 @@ _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
 _SYMMETRIC_WITHIN = 0.05
 #: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
 _SAME_POSE_D2 = 1e-3
+#: a match this near (ln odds, with the past) to one believed without it speaks against it
+_OPPOSED_WITHIN = 7.0
+#: fewer spots than make a pose can still say, with the past, where the frame is: as rivals they count
+_LEAST_WITH_PAST = 3
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
 
@@ -331,7 +352,7 @@ class Tracker:
         matches = weigh(self.model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES)
         if matches is None:
             return None
-        verdict = self._decided(self._rivals(matches, scene, LEAST_MATCHES), prediction, scene, spots, scale)
+        verdict = self._decided(self._rivals(matches, scene, _LEAST_WITH_PAST), prediction, scene, spots, scale)
         if verdict.status != "ok" or not continues(verdict.candidates[0], prediction):
             return None
         return self._straight(verdict, prediction, scene)
@@ -350,12 +371,57 @@ class Tracker:
         self, matches: Matches, prediction: Prediction | None, scene: Scene, spots: Spots, scale: Scale
     ) -> Registration:
         """The verdict on matches weighed with what the past says."""
-        if prediction is not None:
-            matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
-        verdict = decide(self.model, scene, spots, scale, matches, self.options.registration)
+        model = self.model
+        if prediction is None:
+            weighed = Weighed.alone(model, matches)
+        else:
+            weighed = PastPrior.of(model, scene, prediction).applied(model, scene, matches)
+        if int((weighed.matches.spot_of_rod[0] >= 0).sum()) < LEAST_MATCHES:
+            return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
+        settled = reconciled(weighed)
+        verdict = decide(model, scene, spots, scale, weighed.matches.subset(~settled), self.options.registration)
+        if verdict.reason == "not_linear" and prediction is not None and len(verdict.candidates) == 1:
+            verdict = self._straightened(verdict, weighed, prediction, scene, spots)
         if verdict.status != "ok":
             return verdict
-        return replace(verdict, candidates=(covering(self.model, matches, verdict.candidates[0]),))
+        best = covering_reconciled(verdict.candidates[0], weighed.subset(settled))
+        rivals = hangs_on_one_spot(model, weighed, best)
+        if rivals.any():
+            others = refined_candidates(model, scene, spots, scale, weighed.matches.subset(rivals))
+            return replace(verdict, status="ambiguous", reason="rival_pose", candidates=(best, *others))
+        return replace(verdict, candidates=(covering(model, weighed, best),))
+
+    def _straightened(
+        self, verdict: Registration, weighed: Weighed, prediction: Prediction, scene: Scene, spots: Spots
+    ) -> Registration:
+        """A verdict ``not_linear``, or ``ok`` where the past leaves only a straight piece of the valley."""
+        model, options = self.model, self.options.registration
+        best = straightened(model, scene, weighed, verdict.candidates[0], prediction.T, prediction.covariance)
+        if best is None:
+            return verdict
+        seen = observations(scene, weighed.matches.spot_of_rod[:1])
+        covariance, suspicion = covariance_with_misfit(model, best.T_slice_model, best.covariance, seen)
+        if covariance is None or suspicion:
+            return verdict
+        best = protected(model, scene, best, options)
+        if options.alert_limit_mm is not None and best.protection_mm.max() > options.alert_limit_mm:
+            return replace(verdict, status="no_pose", reason="unprotected", candidates=())
+        warnings = (
+            (
+                "curved_cost",
+                "the cost is no ellipsoid along its weakest direction; the past settles the pose",
+            ),
+            *fit_warnings(model, spots, best),
+        )
+        return replace(verdict, status="ok", reason="", candidates=(best,), warnings=warnings)
+
+    def _is_opposed(self, best: Candidate, matches: Matches, prediction: Prediction, scene: Scene) -> bool:
+        """Whether the past speaks for another pose than one that was believed without it."""
+        weighed = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
+        distance2 = weighed.distance2(best.T_slice_model, best.covariance)
+        same = distance2 < _SAME_POSE_D2
+        own = float(weighed.matches.log_odds[same].max(initial=-np.inf))
+        return bool(((weighed.matches.log_odds > own - _OPPOSED_WITHIN) & (distance2 > RIVAL_SD**2)).any())
 
     def _straight(self, verdict: Registration, prediction: Prediction, scene: Scene) -> Registration:
         """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``."""
@@ -384,11 +450,15 @@ class Tracker:
             pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], least))
         found = [matches for matches in pool if matches is not None]
         if found:
-            matches = self._rivals(join(found), scene, least)
+            # what is looked for must be able to stand alone; what speaks against it need not
+            fewest = LEAST_MATCHES if prediction is None else _LEAST_WITH_PAST
+            matches = self._rivals(join(found), scene, fewest)
             verdict = self._decided(matches, prediction, scene, spots, scale)
             if prediction is not None and verdict.status == "no_pose":
-                # nothing where the past expects it: the past is wrong, and the slice stands on its own
-                verdict = self._decided(matches, None, scene, spots, scale)
+                # nothing sure where the past expects it: the past may be wrong, and the slice stands on its own
+                alone = self._decided(matches, None, scene, spots, scale)
+                if alone.status != "ok" or not self._is_opposed(alone.candidates[0], matches, prediction, scene):
+                    verdict = alone
         else:
             reason = "no_consistent_match" if pool else "too_few_spots"
             verdict = Registration(status="no_pose", reason=reason, n_spots=len(spots))

@@ -6,24 +6,16 @@ doubted at little cost and no rival is overlooked that lies close by.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from ctreg_cli.arrays import IntArray, frozen
+from ctreg_cli.arrays import IntArray
 from ctreg_cli.design.symmetry import Symmetry
-from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.registration.matching import Matches, Scene, join, weigh
-from ctreg_cli.registration.refine import covariance_from_information
-from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
 
 #: a rod whose crossing lies this near a spot (in frame sizes) could be the spot's
 _NEAR_SIZES = 0.15
-#: a match that moves the pose by more than this (χ² of six degrees of freedom) must be better supported than
-#: 1000 : 1 (ln), or the covariance has to cover the pose without it
-_INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 7.5
 
 
 def with_other_rods(model: RodModel, scene: Scene, matches: Matches, least_matches: int) -> Matches:
@@ -70,25 +62,3 @@ def with_twins(
     spot_of_rod = np.stack([matches.spot_of_rod[0][s.image] for s in symmetric])
     found = weigh(model, scene, T, spot_of_rod, least_matches)
     return matches if found is None else join([matches, found])
-
-
-def covering(model: RodModel, matches: Matches, best: Candidate) -> Candidate:
-    """``best`` with a covariance that covers the poses without each match that is influential and not well supported.
-
-    Such a match may be a false spot that happens to fit. The odds say how seldom; but where one spot decides so much,
-    more is asked than for the rest.
-    """
-    own = np.full(len(model), -1, dtype=np.intp)
-    own[best.rod_index] = best.spot_index
-    fewer = (matches.spot_of_rod == own) | (matches.spot_of_rod < 0)
-    less = fewer.all(axis=1) & (matches.spot_of_rod != own).any(axis=1)
-    less &= matches.log_odds > best.log_odds - _WELL_SUPPORTED
-    H, _ = matches.fit.normal_equations()
-    C, _ = covariance_from_information(H, model.size_mm)
-    information = np.linalg.inv(best.covariance)
-    covariance = np.array(best.covariance)
-    for row in np.nonzero(less)[0]:
-        apart = poses.difference(matches.T[row], best.T_slice_model)
-        if apart @ information @ apart > _INFLUENTIAL_D2:
-            covariance += 0.5 * (C[row] + np.outer(apart, apart))
-    return replace(best, covariance=frozen(covariance, (6, 6)))
