@@ -17,7 +17,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.evidence import PosePrior, log_odds
 from ctreg_cli.registration.matching import Matches, Scene, observations
-from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
+from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import difference, log_determinant, solve_positive
 
@@ -27,8 +27,8 @@ JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5
 _FIELD_SIZES = 3.0
 #: a jump to where a match puts the frame is out of the question when it lies this far (ln) under the best match
 _OUT_OF_THE_QUESTION = 10.0
-#: steps to the pose most probable with the past; the last of them, in sd², must be less than this
-_MAP_STEPS, _MAP_DONE2 = 7, 1e-2
+#: steps to the pose most probable with the past, when they are enough, and what the last must be less than, sd²
+_MAP_STEPS, _MAP_DONE2, _MAP_FOUND2 = 8, 1e-5, 1e-2
 
 
 class Predicted(Protocol):
@@ -88,22 +88,16 @@ class PastPrior:
         H, _ = matches.fit.normal_equations()
         C, _ = covariance_from_information(H, model.size_mm)
         density = np.array([self.log_density(T, c) for T, c in zip(matches.T, C, strict=True)])
-        odds = log_odds(
-            model,
-            scene.prior,
-            scene.xy_mm,
-            matches.T,
-            matches.fit,
-            matches.spot_of_rod >= 0,
-            matches.expected,
-            log_prior_density=density,
-        )
+        odds = _odds(model, scene, matches, matches.T, matches.fit, density)
         jumped = odds - density + np.array([self.log_jumped(T) for T in matches.T])
-        T_near, C_near, settled = most_probable(
-            model, observations(scene, matches.spot_of_rod), self.T, self.covariance
-        )
+        seen = observations(scene, matches.spot_of_rod)
+        nearby = most_probable(model, seen, self.T, self.covariance)
+        # where a valley bends, the spots' own pose and an ellipsoid about it say little of what lies where the past is
+        odds_nearby = _odds(model, scene, matches, nearby.T, nearby.fit, self._log_density_nearby(nearby))
+        leads = nearby.found & _leads_there(matches, nearby)
+        odds = np.where(leads, np.maximum(odds, odds_nearby), odds)
         # where a jump is not out of the question, only what the spots say counts
-        near = settled & (jumped < odds.max() - _OUT_OF_THE_QUESTION)
+        near = nearby.found & (jumped < odds.max() - _OUT_OF_THE_QUESTION)
         order = np.argsort(-odds, kind="stable")
         weighed = Matches(
             T=matches.T, spot_of_rod=matches.spot_of_rod, log_odds=odds, fit=matches.fit, expected=matches.expected
@@ -111,9 +105,47 @@ class PastPrior:
         return Weighed(
             matches=weighed.subset(order),
             covariance=C[order],
-            T_if_true=np.where(near[:, None, None], T_near, matches.T)[order],
-            covariance_if_true=np.where(near[:, None, None], C_near, C)[order],
+            T_if_true=np.where(near[:, None, None], nearby.T, matches.T)[order],
+            covariance_if_true=np.where(near[:, None, None], nearby.covariance, C)[order],
         )
+
+    def _log_density_nearby(self, nearby: MostProbable) -> FloatArray:
+        """(b,) ln of the part of π where the past is, averaged over what the spots leave open there."""
+        apart = poses.difference(nearby.T, self.T)
+        distance2 = np.einsum("bi,ij,bj->b", apart, np.linalg.inv(self.covariance), apart)
+        _, by_spots = np.linalg.slogdet(nearby.fit.normal_equations()[0])
+        _, by_both = np.linalg.slogdet(nearby.covariance)
+        _, by_past = np.linalg.slogdet(self.covariance)
+        density: FloatArray = math.log1p(-self.p_jump) - 0.5 * (distance2 + by_past - by_both - by_spots)
+        return density - 3 * math.log(2 * math.pi)
+
+
+def _leads_there(matches: Matches, nearby: MostProbable) -> BoolArray:
+    """(b,) of the minima that the same matches have, the one nearest to what is most probable with the past."""
+    apart = np.stack([difference(T, there) for T, there in zip(matches.T, nearby.T, strict=True)])
+    distance2 = np.einsum("bi,bij,bj->b", apart, nearby.fit.normal_equations()[0], apart)
+    first: dict[bytes, int] = {}
+    for row in np.argsort(distance2, kind="stable"):
+        first.setdefault(matches.spot_of_rod[row].tobytes(), int(row))
+    leads = np.zeros(len(matches), dtype=bool)
+    leads[list(first.values())] = True
+    return leads
+
+
+def _odds(
+    model: RodModel, scene: Scene, matches: Matches, T: FloatArray, fit: Linearisation, log_prior_density: FloatArray
+) -> FloatArray:
+    """:func:`~ctreg_cli.registration.evidence.log_odds` of matches at poses ``T`` with the past's density there."""
+    return log_odds(
+        model,
+        scene.prior,
+        scene.xy_mm,
+        T,
+        fit,
+        matches.spot_of_rod >= 0,
+        matches.expected,
+        log_prior_density=log_prior_density,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,26 +181,43 @@ class Weighed:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MostProbable:
+    """``b`` matches' most probable poses with the past taken in."""
+
+    #: (b, 4, 4), and (b, 6, 6) their covariances
+    T: FloatArray
+    covariance: FloatArray
+    #: the spots there
+    fit: Linearisation
+    #: (b,) whether there is such a pose near where the past expects the frame
+    found: BoolArray
+
+
 def most_probable(
     model: RodModel, seen: Observations, T_predicted: FloatArray, predicted_covariance: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """The most probable poses (b, 4, 4) with the past taken in, their covariances (b, 6, 6), and which were found.
+) -> MostProbable:
+    """The poses most probable with the past taken in, by Gauss–Newton from where it expects the frame.
 
     Args:
         model: the rods.
         seen: ``b`` hypotheses.
-        T_predicted: (4, 4) where the past expected the frame.
+        T_predicted: (4, 4) where the past expects the frame.
         predicted_covariance: (6, 6) of it.
     """
     b = len(seen.matched)
     P_inverse = np.linalg.inv(predicted_covariance)
     T = np.repeat(T_predicted[None], b, axis=0)
+    fit = linearise(model, T, seen)
     size2 = np.full(b, np.inf)
     C = np.empty((b, 6, 6))
     for _ in range(_MAP_STEPS):
-        H, g = linearise(model, T, seen).normal_equations()
+        H, g = fit.normal_equations()
         C = np.linalg.inv(H + P_inverse)
         step = (C @ (g - poses.difference(T, T_predicted) @ P_inverse)[..., None])[..., 0]
         size2 = np.einsum("bi,bij,bj->b", step, H + P_inverse, step)
         T = poses.update(T, step)
-    return T, C, size2 < _MAP_DONE2
+        fit = linearise(model, T, seen)
+        if size2.max() < _MAP_DONE2:
+            break
+    return MostProbable(T=T, covariance=C, fit=fit, found=(size2 < _MAP_FOUND2) & np.isfinite(fit.chi2))

@@ -18,7 +18,17 @@ import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import Crossing, cross, inverse_2x2, inverse_positive, lines_of, solve_positive, updated
+from ctreg_cli.tracking.single import (
+    Crossing,
+    cross,
+    greatest_tolerance_mm,
+    inverse_2x2,
+    inverse_positive,
+    lines_of,
+    model_lines,
+    solve_positive,
+    updated,
+)
 
 #: a step never turns the frame by more than this, rad
 _MAX_TURN_RAD = 0.5
@@ -64,13 +74,14 @@ class Desired:
         mm_per_px: FloatArray | None = None,
     ) -> Desired:
         """The spots ``uv_px`` (k, 2) of the rods with the indices ``rods`` (k,)."""
+        whole = len(rods) == len(model) and rods.tolist() == list(range(len(model)))
         return cls(
-            lines=lines_of(model, rods),
-            tolerances=model.tolerances[rods],
+            lines=model_lines(model) if whole else lines_of(model, rods),
+            tolerances=model.tolerances if whole else model.tolerances[rods],
             uv_px=uv_px,
             covariance_px=covariance_px,
             mm_per_px=mm_per_px,
-            weight=None if model.tolerances.any() else inverse_2x2(covariance_px),
+            weight=None if greatest_tolerance_mm(model) > 0 else inverse_2x2(covariance_px),
         )
 
 
@@ -98,8 +109,13 @@ class View:
     @property
     def rms_px(self) -> float:
         """Root mean square of the residuals over both coordinates."""
+        return math.sqrt(self.sum_of_squares_px2 / self.residual_px.size)
+
+    @property
+    def sum_of_squares_px2(self) -> float:
+        """Σ rᵀ r."""
         r = self.residual_px.ravel()
-        return math.sqrt(float(r @ r) / len(r))
+        return float(r @ r)
 
     def weighted(self, jacobian: FloatArray) -> FloatArray:
         """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
@@ -146,6 +162,8 @@ class ServoResult:
     view: View
     #: (6, 6) of the pose error ``[V; Ω]``, mm and rad: the Cramér–Rao bound for *updated*, a little more for *constant*
     covariance: FloatArray
+    #: (6, 6) ``Jᵀ W J`` with the true Jacobian there
+    information: FloatArray
     iterations: int
     converged: bool
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J at the end
@@ -214,7 +232,7 @@ def servo(
         converged = (
             moved_sd2 <= options.spot_tolerance_sd**2
             or max(map(abs, (step * unit).tolist())) <= options.step_tolerance * model.size_mm
-            or here.rms_px <= options.residual_tolerance
+            or here.sum_of_squares_px2 <= options.residual_tolerance**2 * here.residual_px.size
         )
         if converged or iterations >= options.max_iterations:
             break
@@ -235,6 +253,7 @@ def servo(
         T=T,
         view=here,
         covariance=law.covariance(here),
+        information=law.information if jacobian is None else here.weighted(here.jacobian).T @ here.jacobian,
         iterations=iterations,
         converged=converged,
         margin=law.margin(here, model.size_mm) if converged else -np.inf,

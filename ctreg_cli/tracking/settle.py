@@ -21,6 +21,7 @@ from ctreg_cli.registration.register import RIVAL_SD, averaged
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.prior import Weighed, most_probable
+from ctreg_cli.tracking.verify import is_surprising
 
 #: a rival is reconciled when the verdict's pose would be this little wrong (χ² of six degrees of freedom) if it is true
 _RECONCILED_D2 = 20.0
@@ -33,8 +34,6 @@ _ALONE_DECIDES = 9.0
 _INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 10.0
 #: what three sd must cost at least and at most (an ellipsoid: 9) for the past to have straightened a valley
 _LEAST_RISE, _MOST_RISE = 4.5, 18.0
-#: the pose of the spots may then be wrong by so many of the sd they have where the past puts it
-_SURPRISE_SD = 4.0
 _PROFILE_STEPS = 4
 
 
@@ -122,15 +121,14 @@ def straightened(
         None where the past does not settle it.
     """
     seen = observations(scene, weighed.matches.spot_of_rod[:1])
-    T, C, found = most_probable(model, seen, T_predicted, predicted_covariance)
-    if not found[0] or not _is_straight(model, seen, T[0], C[0], T_predicted, predicted_covariance):
+    nearby = most_probable(model, seen, T_predicted, predicted_covariance)
+    T, C = nearby.T[0], nearby.covariance[0]
+    if not nearby.found[0] or not _is_straight(model, seen, T, C, T_predicted, predicted_covariance):
         return None
-    apart = poses.difference(T[0], best.T_slice_model)
-    by_spots = np.linalg.pinv(linearise(model, T, seen).normal_equations()[0][0], hermitian=True)
-    for part in (slice(3), slice(3, 6)):
-        if apart[part] @ apart[part] > _SURPRISE_SD**2 * np.trace(by_spots[part, part]):
-            return None
-    covered = best.covariance + positive_part(C[0] + np.outer(apart, apart) - best.covariance)
+    apart = poses.difference(T, best.T_slice_model)
+    if is_surprising(apart, nearby.fit.normal_equations()[0][0]):
+        return None
+    covered = best.covariance + positive_part(C + np.outer(apart, apart) - best.covariance)
     best = replace(best, covariance=frozen(covered, (6, 6)))
     others = weighed.matches.log_odds > best.log_odds - _RIVALS_WITHIN
     others[0] = False

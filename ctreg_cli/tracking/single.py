@@ -52,6 +52,12 @@ def model_lines(model: RodModel) -> FloatArray:
     return lines(model.starts, model.directions)
 
 
+@lru_cache(maxsize=16)
+def greatest_tolerance_mm(model: RodModel) -> float:
+    """Of any rod; cached, since a model is a value that never changes."""
+    return float(model.tolerances.max())
+
+
 def lines_of(model: RodModel, rods: IntArray) -> FloatArray:
     """:func:`lines` of the rods with the indices ``rods`` (k,), in their order."""
     columns = model_lines(model)

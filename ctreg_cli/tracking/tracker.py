@@ -40,7 +40,7 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
-from ctreg_cli.tracking.gate import GATE_SD, Outlook
+from ctreg_cli.tracking.gate import GATE_SD, Outlook, spread
 from ctreg_cli.tracking.prior import PastPrior, Weighed
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
 from ctreg_cli.tracking.settle import (
@@ -110,7 +110,8 @@ class Prediction:
     #: (n, 2) px, and whether each rod may be seen
     spots_px: FloatArray
     visible: BoolArray
-    #: (n,) radius within which each spot should lie, px
+    #: (n, 2, 2) covariance of the crossings, and the (n,) radius within which each spot should lie, px
+    spread_mm2: FloatArray
     radius_px: FloatArray
     #: the same as a motion, and the time it bridges: s, and slices
     motion: motion.MotionState
@@ -181,8 +182,8 @@ class Tracker:
         G = axes.slice_twist(T)
         covariance = G @ moved.pose_covariance @ G.T
         crossing = cross(T, model_lines(model))
-        J = crossing.jacobian
-        reach = np.sqrt((J @ covariance * J).sum(axis=2).max(axis=1))
+        spread_mm2 = spread(crossing, covariance)
+        reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
         # how far along a rod that moves the slice
         slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height()
         visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
@@ -193,6 +194,7 @@ class Tracker:
             crossing=crossing,
             spots_px=crossing.xy_mm / s,
             visible=visible,
+            spread_mm2=spread_mm2,
             radius_px=reach * (GATE_SD / min(scale.s_x, scale.s_y)),
             motion=moved,
             dt_s=dt_s,
@@ -295,7 +297,7 @@ class Tracker:
     ) -> tuple[_Followed | None, str]:
         model = self.model
         T, crossing = prediction.T, prediction.crossing
-        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance)
+        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance, prediction.spread_mm2)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -479,7 +481,8 @@ class Tracker:
             agrees = len(scene.xy_mm) < CHECKABLE_MATCHES
             agrees |= any(continues(candidate, prediction) for candidate in verdict.candidates)
             if not agrees:
-                gated = Outlook(self.model, scene, prediction.T, prediction.crossing).assigned(prediction.covariance)
+                outlook = Outlook(self.model, scene, prediction.T, prediction.crossing)
+                gated = outlook.assigned(prediction.covariance, prediction.spread_mm2)
                 agrees = int((gated >= 0).sum()) >= _MATCHES_THAT_AGREE
             self._is_lost = True
             self.miss()
@@ -544,7 +547,7 @@ class Tracker:
             registration=sure,
             method="reacquired" if self._is_lost else method,
             stability=margin,
-            velocity=self._velocity(state, best.T_slice_model, info),
+            velocity=self._velocity(state, G, info),
             begins=prediction is None,
         )
         self._is_lost = False
@@ -559,11 +562,14 @@ class Tracker:
         )
         return tracked
 
-    def _velocity(self, state: motion.MotionState, T_slice_model: FloatArray, info: SliceInfo) -> Velocity | None:
-        """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known."""
+    def _velocity(self, state: motion.MotionState, to_still: FloatArray, info: SliceInfo) -> Velocity | None:
+        """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known.
+
+        ``to_still``: (6, 6) what takes a twist at the model origin in slice axes to the middle's.
+        """
         if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
-        G = self._axes(info).slice_twist(T_slice_model)
+        G = motion.inverse_twist(to_still)
         return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
 
 
@@ -583,8 +589,7 @@ def _unfit(moved: ServoResult) -> str:
     """Why a constant Jacobian is not trusted any more; empty while it is."""
     if moved.margin < LEAST_MARGIN:
         return f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
-    information = moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian
-    if float((information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
+    if float((moved.information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
         return "the constant Jacobian has become inefficient"
     return ""
 
