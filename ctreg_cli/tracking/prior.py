@@ -19,10 +19,13 @@ from ctreg_cli.registration.evidence import PosePrior, log_odds
 from ctreg_cli.registration.matching import Matches, Scene, observations
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import difference, log_determinant, solve_positive
+from ctreg_cli.tracking.single import difference, log_determinant, shifted, solve_positive
+from ctreg_cli.tracking.variants import Twin
 
 #: probability that the frame is moved by hand from one slice to the next, or within a second; the most it may become
 JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5
+#: share of the jumps that put a frame which looks much alike the other way round back to where it was, that way round
+_OTHER_WAY = 0.05
 #: side of the field a frame may lie in, in its own sizes
 _FIELD_SIZES = 3.0
 #: a jump to where a match puts the frame is out of the question when it lies this far (ln) under the best match
@@ -57,10 +60,12 @@ class PastPrior:
     anywhere: PosePrior
     #: mm³
     volume_mm3: float
+    #: poses (4, 4), each with a (6, 6) covariance, of the frame put back the other way round
+    other_ways: tuple[tuple[FloatArray, FloatArray], ...] = ()
 
     @classmethod
-    def of(cls, model: RodModel, scene: Scene, prediction: Predicted) -> PastPrior:
-        """The prior that a prediction makes."""
+    def of(cls, model: RodModel, scene: Scene, prediction: Predicted, twins: tuple[Twin, ...] = ()) -> PastPrior:
+        """The prior that a prediction makes; ``twins`` of the frame."""
         p_jump = min(JUMP_A_SLICE * prediction.n_slices + JUMP_A_SECOND * prediction.dt_s, MOST_JUMP)
         return cls(
             T=prediction.T,
@@ -68,20 +73,22 @@ class PastPrior:
             p_jump=p_jump,
             anywhere=scene.prior,
             volume_mm3=2 * _FIELD_SIZES**2 * model.size_mm**3,
+            other_ways=tuple(_turned_over(prediction, twin) for twin in twins),
         )
 
     def log_density(self, T: FloatArray, covariance: FloatArray) -> float:
         """ln π, per mm³ rad³, of a pose (4, 4) measured with ``covariance`` (6, 6), which it is averaged over."""
-        innovation = difference(T, self.T)
-        S = self.covariance + covariance
-        distance2 = float(innovation @ solve_positive(S, innovation))
-        near = -0.5 * (distance2 + log_determinant(S)) - 3 * math.log(2 * math.pi)
-        return float(np.logaddexp(math.log1p(-self.p_jump) + near, self.log_jumped(T)))
+        near = math.log1p(-self.p_jump) + _log_normal(difference(T, self.T), self.covariance + covariance)
+        return float(np.logaddexp(near, self.log_jumped(T, covariance)))
 
-    def log_jumped(self, T: FloatArray) -> float:
+    def log_jumped(self, T: FloatArray, covariance: FloatArray) -> float:
         """ln of the part of π, per mm³ rad³, that is left to a pose (4, 4) after a jump."""
         anywhere = float(self.anywhere.log_density(T[None, :3, :3])[0]) - math.log(self.volume_mm3)
-        return math.log(self.p_jump) + anywhere
+        if not self.other_ways:
+            return math.log(self.p_jump) + anywhere
+        share = math.log(_OTHER_WAY / len(self.other_ways))
+        ways = [share + _log_normal(poses.difference(T, T0), P + covariance) for T0, P in self.other_ways]
+        return math.log(self.p_jump) + float(np.logaddexp.reduce([math.log1p(-_OTHER_WAY) + anywhere, *ways]))
 
     def applied(self, model: RodModel, scene: Scene, matches: Matches) -> Weighed:
         """Matches weighed anew with this prior, best first, and where the frame then is if each of them is true."""
@@ -89,7 +96,7 @@ class PastPrior:
         C, _ = covariance_from_information(H, model.size_mm)
         density = np.array([self.log_density(T, c) for T, c in zip(matches.T, C, strict=True)])
         odds = _odds(model, scene, matches, matches.T, matches.fit, density)
-        jumped = odds - density + np.array([self.log_jumped(T) for T in matches.T])
+        jumped = odds - density + np.array([self.log_jumped(T, c) for T, c in zip(matches.T, C, strict=True)])
         seen = observations(scene, matches.spot_of_rod)
         nearby = most_probable(model, seen, self.T, self.covariance)
         # where a valley bends, the spots' own pose and an ellipsoid about it say little of what lies where the past is
@@ -118,6 +125,17 @@ class PastPrior:
         _, by_past = np.linalg.slogdet(self.covariance)
         density: FloatArray = math.log1p(-self.p_jump) - 0.5 * (distance2 + by_past - by_both - by_spots)
         return density - 3 * math.log(2 * math.pi)
+
+
+def _turned_over(prediction: Predicted, twin: Twin) -> tuple[FloatArray, FloatArray]:
+    """The predicted pose (4, 4) of the frame with the motion of a twin done to it, and its (6, 6) covariance."""
+    G = shifted(prediction.T[:3, :3] @ twin.transform[:3, 3])
+    return prediction.T @ twin.transform, G @ prediction.covariance @ G.T
+
+
+def _log_normal(x: FloatArray, S: FloatArray) -> float:
+    """ln of the normal density of x (6,) with mean zero and covariance S (6, 6)."""
+    return -0.5 * (float(x @ solve_positive(S, x)) + log_determinant(S)) - 3 * math.log(2 * math.pi)
 
 
 def _leads_there(matches: Matches, nearby: MostProbable) -> BoolArray:

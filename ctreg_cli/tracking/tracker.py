@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.design.symmetry import symmetries
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
@@ -51,7 +50,7 @@ from ctreg_cli.tracking.settle import (
     straightened,
 )
 from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
-from ctreg_cli.tracking.variants import with_other_rods, with_twins
+from ctreg_cli.tracking.variants import twins, with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -62,8 +61,6 @@ LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 _ASSIGNMENTS = 3
 #: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
 _DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
-#: motions that take the rods onto each other as nearly as this (in frame sizes) make a twin worth looking at
-_SYMMETRIC_WITHIN = 0.05
 #: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
 _SAME_POSE_D2 = 1e-3
 #: a match this near (ln odds, with the past) to one believed without it speaks against it
@@ -153,7 +150,7 @@ class Tracker:
         #: (n, 2, 6) Ĵ of the constant strategy, mm per mm and rad
         self._kept_jacobian: FloatArray | None = None
         self._is_lost = False
-        self._symmetries = symmetries(model, within_mm=_SYMMETRIC_WITHIN * model.size_mm)
+        self._twins = twins(model)
         gain = self.options.gain
         self._servo_options = ServoOptions(
             gain=gain, spot_tolerance_sd=_DONE_SD, max_iterations=math.ceil(_MAX_FULL_STEPS / gain)
@@ -335,6 +332,8 @@ class Tracker:
     def _verified(
         self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
     ) -> Registration | None:
+        if self._twins and len(scene.xy_mm) > int((followed.spot_of_rod >= 0).sum()) and not self._all_seen(followed):
+            return None  # put the other way round, it might miss no rod and leave no spot
         return verified(
             followed.outlook,
             scale,
@@ -345,6 +344,10 @@ class Tracker:
             followed.spot_of_rod,
             self.options.registration,
         )
+
+    def _all_seen(self, followed: _Followed) -> bool:
+        """Whether every rod that must be seen has a spot."""
+        return not (followed.outlook.must_be_seen() & (followed.spot_of_rod < 0)).any()
 
     # --- 2. doubt ----------------------------------------------------------------------------------------------------
 
@@ -361,7 +364,7 @@ class Tracker:
 
     def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
         """Matches and all that could be said instead of the best of them."""
-        matches = with_twins(self.model, scene, matches, self._symmetries, least_matches)
+        matches = with_twins(self.model, scene, matches, self._twins, least_matches)
         asked = matches.spot_of_rod[0]
         matches = with_other_rods(self.model, scene, matches, least_matches)
         matches = doubt(self.model, scene, matches, least_matches=least_matches)
@@ -377,7 +380,7 @@ class Tracker:
         if prediction is None:
             weighed = Weighed.alone(model, matches)
         else:
-            weighed = PastPrior.of(model, scene, prediction).applied(model, scene, matches)
+            weighed = PastPrior.of(model, scene, prediction, self._twins).applied(model, scene, matches)
         if int((weighed.matches.spot_of_rod[0] >= 0).sum()) < LEAST_MATCHES:
             return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
         settled = reconciled(weighed)
@@ -419,7 +422,7 @@ class Tracker:
 
     def _is_opposed(self, best: Candidate, matches: Matches, prediction: Prediction, scene: Scene) -> bool:
         """Whether the past speaks for another pose than one that was believed without it."""
-        weighed = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
+        weighed = PastPrior.of(self.model, scene, prediction, self._twins).applied(self.model, scene, matches)
         distance2 = weighed.distance2(best.T_slice_model, best.covariance)
         same = distance2 < _SAME_POSE_D2
         own = float(weighed.matches.log_odds[same].max(initial=-np.inf))

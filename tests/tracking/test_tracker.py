@@ -301,6 +301,25 @@ def test_what_is_ambiguous_is_settled_by_a_certain_past_and_only_by_it() -> None
     assert {r.status for r in track(later)[6:]} == {"ambiguous"}
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_frame_put_back_the_other_way_round_is_not_followed_as_if_nothing_were(seed: int) -> None:
+    """All rods but one map onto each other: the old pose misses that rod, leaves one spot, and fits all others."""
+    turn = np.diag([-1.0, -1.0, 1.0])
+    even = half_turned(random_frame(np.random.default_rng(seed), 4))
+    frame = OracleFrame(
+        np.concatenate([even.starts, [[4.0, 1.0, -20.0]]]), np.concatenate([even.ends, [[5.0, 3.0, 20.0]]])
+    )
+    turned = OracleFrame(frame.starts @ turn, frame.ends @ turn)
+    made, after = (
+        sequence(seed, kind="drift", n=14, frame=f, sd_px=0.1, p_missing=0.0, most_false=0) for f in (frame, turned)
+    )
+    made.slices[7:] = after.slices[7:]
+    made.truth[7:] = [replace(true, R=true.R @ turn) for true in after.truth[7:]]
+    results = track(made)
+    assert not wrong(results, made)
+    assert [r.status for r in results].count("ok") >= 13
+
+
 def without_rod(made: Sequence, i: int, rod: int) -> SpotSlice:
     """Slice ``i`` without the spot of ``rod``."""
     place = made.frame.starts[rod], made.frame.ends[rod]
