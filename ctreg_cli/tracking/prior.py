@@ -16,7 +16,7 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.evidence import PosePrior, log_odds
-from ctreg_cli.registration.matching import Matches, Scene, observations
+from ctreg_cli.registration.matching import Matches, Scene, distinct, join, observations, weigh
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import difference, log_determinant, shifted, solve_positive
@@ -30,6 +30,10 @@ _OTHER_WAY = 0.05
 _FIELD_SIZES = 3.0
 #: a jump to where a match puts the frame is out of the question when it lies this far (ln) under the best match
 _OUT_OF_THE_QUESTION = 10.0
+#: a minimum farther (sd²) from there than this is perhaps not the only one
+_ANOTHER_MINIMUM_D2 = 30.0
+#: so many spots determine a pose
+_LEAST_DETERMINED = 3
 #: steps to the pose most probable with the past, when they are enough, and what the last must be less than, sd²
 _MAP_STEPS, _MAP_DONE2, _MAP_FOUND2 = 8, 1e-5, 1e-2
 
@@ -92,17 +96,25 @@ class PastPrior:
 
     def applied(self, model: RodModel, scene: Scene, matches: Matches) -> Weighed:
         """Matches weighed anew with this prior, best first, and where the frame then is if each of them is true."""
+        seen = observations(scene, matches.spot_of_rod)
+        nearby = most_probable(model, seen, self.T, self.covariance)
+        leads, distance2 = _leads_there(matches, nearby)
+        # the same matches may have another minimum, where the past is
+        other = leads & nearby.found & (distance2 > _ANOTHER_MINIMUM_D2)
+        more = weigh(model, scene, nearby.T[other], matches.spot_of_rod[other], _LEAST_DETERMINED)
+        if more is not None:
+            matches = distinct(model, join([matches, more]), within=np.inf, most=2 * len(matches))
+            seen = observations(scene, matches.spot_of_rod)
+            nearby = most_probable(model, seen, self.T, self.covariance)
+            leads, _ = _leads_there(matches, nearby)
         H, _ = matches.fit.normal_equations()
         C, _ = covariance_from_information(H, model.size_mm)
         density = np.array([self.log_density(T, c) for T, c in zip(matches.T, C, strict=True)])
         odds = _odds(model, scene, matches, matches.T, matches.fit, density)
         jumped = odds - density + np.array([self.log_jumped(T, c) for T, c in zip(matches.T, C, strict=True)])
-        seen = observations(scene, matches.spot_of_rod)
-        nearby = most_probable(model, seen, self.T, self.covariance)
         # where a valley bends, the spots' own pose and an ellipsoid about it say little of what lies where the past is
         odds_nearby = _odds(model, scene, matches, nearby.T, nearby.fit, self._log_density_nearby(nearby))
-        leads = nearby.found & _leads_there(matches, nearby)
-        odds = np.where(leads, np.maximum(odds, odds_nearby), odds)
+        odds = np.where(leads & nearby.found, np.maximum(odds, odds_nearby), odds)
         # where a jump is not out of the question, only what the spots say counts
         near = nearby.found & (jumped < odds.max() - _OUT_OF_THE_QUESTION)
         order = np.argsort(-odds, kind="stable")
@@ -112,6 +124,7 @@ class PastPrior:
         return Weighed(
             matches=weighed.subset(order),
             covariance=C[order],
+            near=near[order],
             T_if_true=np.where(near[:, None, None], nearby.T, matches.T)[order],
             covariance_if_true=np.where(near[:, None, None], nearby.covariance, C)[order],
         )
@@ -138,8 +151,11 @@ def _log_normal(x: FloatArray, S: FloatArray) -> float:
     return -0.5 * (float(x @ solve_positive(S, x)) + log_determinant(S)) - 3 * math.log(2 * math.pi)
 
 
-def _leads_there(matches: Matches, nearby: MostProbable) -> BoolArray:
-    """(b,) of the minima that the same matches have, the one nearest to what is most probable with the past."""
+def _leads_there(matches: Matches, nearby: MostProbable) -> tuple[BoolArray, FloatArray]:
+    """(b,) of the minima that the same matches have, the one nearest to what is most probable with the past.
+
+    And how far each is from there (b,), in sd² of the spots.
+    """
     apart = np.stack([difference(T, there) for T, there in zip(matches.T, nearby.T, strict=True)])
     distance2 = np.einsum("bi,bij,bj->b", apart, nearby.fit.normal_equations()[0], apart)
     first: dict[bytes, int] = {}
@@ -147,7 +163,7 @@ def _leads_there(matches: Matches, nearby: MostProbable) -> BoolArray:
         first.setdefault(matches.spot_of_rod[row].tobytes(), int(row))
     leads = np.zeros(len(matches), dtype=bool)
     leads[list(first.values())] = True
-    return leads
+    return leads, distance2
 
 
 def _odds(
@@ -173,6 +189,8 @@ class Weighed:
     matches: Matches
     #: (b, 6, 6) of the poses that the spots alone speak for
     covariance: FloatArray
+    #: (b,) whether a jump is out of the question
+    near: BoolArray
     #: (b, 4, 4) the most probable pose with the past taken in, and (b, 6, 6) its covariance; that of the spots alone
     #: where there is no past, or the frame may have jumped
     T_if_true: FloatArray
@@ -182,7 +200,8 @@ class Weighed:
     def alone(cls, model: RodModel, matches: Matches) -> Weighed:
         """Matches that no past says anything of."""
         C, _ = covariance_from_information(matches.fit.normal_equations()[0], model.size_mm)
-        return cls(matches=matches, covariance=C, T_if_true=matches.T, covariance_if_true=C)
+        nowhere = np.zeros(len(matches), dtype=bool)
+        return cls(matches=matches, covariance=C, near=nowhere, T_if_true=matches.T, covariance_if_true=C)
 
     def distance2(self, T: FloatArray, covariance: FloatArray) -> FloatArray:
         """(b,) how far a pose (4, 4) would be wrong, in sd² of its ``covariance`` (6, 6), if each match were true."""
@@ -194,6 +213,7 @@ class Weighed:
         return Weighed(
             matches=self.matches.subset(rows),
             covariance=self.covariance[rows],
+            near=self.near[rows],
             T_if_true=self.T_if_true[rows],
             covariance_if_true=self.covariance_if_true[rows],
         )

@@ -22,7 +22,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import Matches, Scene, doubt, join, observations, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, distinct, doubt, join, observations, search, weigh
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.registration.register import (
@@ -389,6 +389,9 @@ class Tracker:
             verdict = self._straightened(verdict, weighed, prediction, scene, spots)
         if verdict.status != "ok":
             return verdict
+        if prediction is not None and weighed.near[0] and not continues(verdict.candidates[0], prediction):
+            # it is believed for what lies where the past is, and the spots' own pose is elsewhere
+            return replace(verdict, status="ambiguous", reason="not_linear")
         best = covering_reconciled(verdict.candidates[0], weighed.subset(settled))
         rivals = hangs_on_one_spot(model, weighed, best)
         if rivals.any():
@@ -458,6 +461,9 @@ class Tracker:
             # what is looked for must be able to stand alone; what speaks against it need not
             fewest = LEAST_MATCHES if prediction is None else _LEAST_WITH_PAST
             matches = self._rivals(join(found), scene, fewest)
+            expected = None if prediction is None else self._expected(prediction, scene)
+            if expected is not None:
+                matches = distinct(model, join([matches, expected]), within=np.inf, most=2 * len(matches))
             verdict = self._decided(matches, prediction, scene, spots, scale)
             if prediction is not None and verdict.status == "no_pose":
                 # nothing sure where the past expects it: the past may be wrong, and the slice stands on its own
@@ -477,6 +483,12 @@ class Tracker:
         if self._past is not None and not follows_on:
             self._is_lost = True
         return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info, scale)
+
+    def _expected(self, prediction: Prediction, scene: Scene) -> Matches | None:
+        """What the past expects, however little speaks for it."""
+        outlook = Outlook(self.model, scene, prediction.T, prediction.crossing)
+        spot_of_rod = outlook.assigned(prediction.covariance, prediction.spread_mm2)
+        return weigh(self.model, scene, prediction.T[None], spot_of_rod[None], _LEAST_WITH_PAST)
 
     def _lost(self, verdict: Registration, prediction: Prediction | None, scene: Scene) -> Tracked:
         """No sure pose: say so; the past stays only if nothing speaks against it."""

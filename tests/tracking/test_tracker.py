@@ -317,7 +317,8 @@ def test_a_frame_put_back_the_other_way_round_is_not_followed_as_if_nothing_were
     made.truth[7:] = [replace(true, R=true.R @ turn) for true in after.truth[7:]]
     results = track(made)
     assert not wrong(results, made)
-    assert [r.status for r in results].count("ok") >= 13
+    assert [r.status for r in results[:7]] == ["ok"] * 7
+    assert results[-1].status == "ok"  # at the latest by then the other way round is the more probable
 
 
 def without_rod(made: Sequence, i: int, rod: int) -> SpotSlice:
