@@ -18,8 +18,8 @@ from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.single import cross, model_lines
 from ctreg_cli.tracking.tracker import Tracker
-from tests.oracle import OracleFrame, random_frame
-from tests.tracking.sequences import Sequence, error_of, frame_of, is_wrong, model_of, sequence
+from tests.oracle import OracleFrame, cross_rod, random_frame
+from tests.tracking.sequences import Sequence, TrueSlice, error_of, frame_of, is_wrong, model_of, sequence
 
 CUBE = load_rod_model("rod-cube-30x30x40")
 
@@ -389,8 +389,6 @@ def test_a_table_that_moves_is_taken_out() -> None:
     made = clean("drift", n=2, seed=3)
     true = made.truth[0]
     frame = frame_of(CUBE)
-    from tests.oracle import cross_rod
-
     rng = np.random.default_rng(0)
     slices, truth = [], []
     for i, z in enumerate(np.arange(-8.0, 9.0, 2.0)):
@@ -413,6 +411,37 @@ def test_a_table_that_moves_is_taken_out() -> None:
     last = results[-1].velocity
     assert last is not None
     assert np.abs(last.twist[:3]).max() < 0.5
+
+
+@pytest.mark.parametrize("strategy", ["updated", "constant"])
+def test_rods_enter_and_leave_the_slab(strategy: str) -> None:
+    """A frame whose rods end at different heights sinks through the slice: some end above it, others begin below."""
+    rng = np.random.default_rng(2)
+    whole = random_frame(rng, 10)
+    starts, ends = whole.starts.copy(), whole.ends.copy()
+    along = (whole.ends - whole.starts) / 40.0
+    starts[::3] += 16.0 * along[::3]  # begin at 16 mm of 40
+    ends[1::3] -= 18.0 * along[1::3]  # end at 22 mm
+    frame = OracleFrame(starts, ends)
+    R = Rotation.from_rotvec([0.1, -0.05, 0.4]).as_matrix()
+    slices, truth = [], []
+    for i, z in enumerate(np.linspace(10.0, -10.0, 41)):
+        t = np.array([128.0, 128.0, z])
+        hits = [cross_rod(a, b, R, t) for a, b in zip(starts, ends, strict=True)]
+        rods = [k for k, hit in enumerate(hits) if hit is not None]
+        uv = np.array([hit[0] / 0.5 for hit in hits if hit is not None]) + 0.05 * rng.normal(size=(len(rods), 2))
+        info = SliceInfo(source=str(i), time_s=0.4 * i, scale=Scale(s_x=0.5, s_y=0.5))
+        slices.append(SpotSlice(info=info, spots=Spots.from_points(uv, 0.05)))
+        truth.append(TrueSlice(R=R, t=t, rods=rods, bound=None, has_jumped=False))
+    made = Sequence(frame, model_of(frame), slices, truth)
+    assert len({tuple(true.rods) for true in truth}) >= 5  # rods do come and go
+    results = track(made, jacobian=strategy)
+    assert not wrong(results, made)
+    assert [r.status for r in results].count("ok") >= 39  # where one rod ends beside another, the two may be exchanged
+    for result, true in zip(results, truth, strict=True):
+        if result.status != "ok":
+            continue
+        assert set(result.candidates[0].rod_index.tolist()) <= set(true.rods)
 
 
 def test_the_covariance_is_true() -> None:
