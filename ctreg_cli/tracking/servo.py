@@ -46,6 +46,9 @@ class ServoOptions:
     spot_tolerance_sd: float = 1e-3
     #: ... or when the spots are this close to the measured ones (rms, in their unit)
     residual_tolerance: float = 1e-9
+    #: a full step of the *updated* law is the last, and taken without looking again, if what it leaves is less than so
+    #: much (sd of all spots together) even when it converges no faster than the step before
+    left_over_sd: float = 0.0
     max_iterations: int = 400
 
 
@@ -99,6 +102,18 @@ class View:
     jacobian: FloatArray
     #: the rods and the slice, mm
     crossing: Crossing
+
+    def stepped(self, twist: FloatArray) -> View:
+        """What is seen after a small twist (6,), to first order in spots and residuals."""
+        shift = (self.jacobian @ twist).reshape(-1, 2)
+        return View(
+            spots_px=self.spots_px + shift,
+            residual_px=self.residual_px - shift,
+            covariance_px=self.covariance_px,
+            weight=self.weight,
+            jacobian=self.jacobian,
+            crossing=self.crossing,
+        )
 
     @property
     def chi2(self) -> float:
@@ -226,7 +241,8 @@ def servo(
     here = view(desired, T, crossing)
     law = _Law.of(here, jacobian)
     path = [(T, here, law.margin(here, model.size_mm))] if keep_path else []
-    iterations = 0
+    iterations, before_sd = 0, 0.0
+    looks_no_more = jacobian is None and options.gain == 1.0 and not keep_path
     while True:
         step, moved_sd2 = law.full_step(here)
         converged = (
@@ -236,6 +252,10 @@ def servo(
         )
         if converged or iterations >= options.max_iterations:
             break
+        if looks_no_more and moved_sd2 <= options.left_over_sd * before_sd:
+            T, here, iterations, converged = updated(T, step), here.stepped(step), iterations + 1, True
+            break
+        before_sd = math.sqrt(moved_sd2)
         step *= options.gain
         turn = math.sqrt(float(step[3:] @ step[3:]))
         if turn > _MAX_TURN_RAD:

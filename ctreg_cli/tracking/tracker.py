@@ -60,7 +60,7 @@ LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 #: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
 _ASSIGNMENTS = 3
 #: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
-_DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
+_DONE_SD, _LEFT_OVER_SD, _MAX_FULL_STEPS = 3e-3, 0.03, 30
 #: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
 _SAME_POSE_D2 = 1e-3
 #: a match this near (ln odds, with the past) to one believed without it speaks against it
@@ -153,7 +153,10 @@ class Tracker:
         self._twins = twins(model)
         gain = self.options.gain
         self._servo_options = ServoOptions(
-            gain=gain, spot_tolerance_sd=_DONE_SD, max_iterations=math.ceil(_MAX_FULL_STEPS / gain)
+            gain=gain,
+            spot_tolerance_sd=_DONE_SD,
+            left_over_sd=_LEFT_OVER_SD,
+            max_iterations=math.ceil(_MAX_FULL_STEPS / gain),
         )
 
     # --- where it should be ------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
@@ -70,6 +71,7 @@ _FIXES_ALONE = 1e-9
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
 _NEIGHBOURHOOD, _LEAST_REACH = 1.25, 1e-3
 _NONE = np.empty(0, dtype=np.intp)
+_Array = TypeVar("_Array", FloatArray, IntArray)
 
 
 def verified(
@@ -127,20 +129,20 @@ def verified(
     residual = seen.residual_px / scale.mm_per_px
     every_residual = residual.ravel()
     best = Candidate(
-        T_slice_model=frozen(T, (4, 4)),
-        covariance=frozen(C, (6, 6)),
-        rod_index=frozen_index(rods),
-        spot_index=frozen_index(spot_of_rod[rods]),
-        residual_px=frozen(residual, (None, 2)),
-        lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
-        missing_rods=frozen_index(missing),
-        missing_px=frozen(crossings.xy_mm[missing] / scale.mm_per_px, (None, 2)),
+        T_slice_model=_kept(T),
+        covariance=_kept(C),
+        rod_index=_kept(rods),
+        spot_index=_kept(spot_of_rod[rods]),
+        residual_px=_kept(residual),
+        lambda_mm=_kept(seen.crossing.lambda_mm),
+        missing_rods=_kept(missing),
+        missing_px=_kept(crossings.xy_mm[missing] / scale.mm_per_px),
         rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
         log_odds=odds,
         iterations=moved.iterations,
-        protection_mm=frozen(protection, (None,)),
+        protection_mm=_kept(protection),
     )
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return None
@@ -152,6 +154,12 @@ def verified(
         n_spots=len(spots),
         warnings=() if clear else fit_warnings(model, spots, best),
     )
+
+
+def _kept(values: _Array) -> _Array:
+    """An array that is this verdict's own, from now on read-only."""
+    values.flags.writeable = False
+    return values
 
 
 def _is_strong(model: RodModel, moved: ServoResult) -> bool:
