@@ -71,13 +71,17 @@ def lacking(model: RodModel, weighed: Weighed, best: Candidate) -> BoolArray:
     return less
 
 
-def hangs_on_one_spot(model: RodModel, weighed: Weighed, best: Candidate) -> BoolArray:
-    """(b,) matches that lack a spot of the best one, contradict it, and are not far less probable."""
-    less = lacking(model, weighed, best) & (weighed.matches.log_odds > best.log_odds - _ALONE_DECIDES)
-    for row in np.nonzero(less)[0]:
+def opposing(model: RodModel, weighed: Weighed, best: Candidate) -> BoolArray:
+    """(b,) matches that contradict the best one, whatever their own covariance, and are not far less probable.
+
+    A sequence is thousands of slices: what one slice may be believed for at 100 : 1 would be wrong in some of them.
+    """
+    behind = best.log_odds - weighed.matches.log_odds
+    near: BoolArray = behind < np.where(lacking(model, weighed, best), _ALONE_DECIDES, _RIVALS_WITHIN)
+    for row in np.nonzero(near)[0]:
         both = best.covariance + weighed.covariance_if_true[row]
-        less[row] = weighed.distance2(best.T_slice_model, both)[row] > RIVAL_SD**2
-    return less
+        near[row] = weighed.distance2(best.T_slice_model, both)[row] > RIVAL_SD**2
+    return near
 
 
 def covering(model: RodModel, weighed: Weighed, best: Candidate) -> Candidate:

@@ -45,7 +45,7 @@ from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
 from ctreg_cli.tracking.settle import (
     covering,
     covering_reconciled,
-    hangs_on_one_spot,
+    opposing,
     reconciled,
     straightened,
 )
@@ -396,7 +396,7 @@ class Tracker:
             # it is believed for what lies where the past is, and the spots' own pose is elsewhere
             return replace(verdict, status="ambiguous", reason="not_linear")
         best = covering_reconciled(verdict.candidates[0], weighed.subset(settled))
-        rivals = hangs_on_one_spot(model, weighed, best)
+        rivals = opposing(model, weighed, best)
         if rivals.any():
             others = refined_candidates(model, scene, spots, scale, weighed.matches.subset(rivals))
             return replace(verdict, status="ambiguous", reason="rival_pose", candidates=(best, *others))
