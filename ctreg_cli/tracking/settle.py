@@ -92,6 +92,8 @@ def covering(model: RodModel, weighed: Weighed, best: Candidate) -> Candidate:
     """
     less = lacking(model, weighed, best) & (weighed.matches.log_odds > best.log_odds - _WELL_SUPPORTED)
     less &= weighed.distance2(best.T_slice_model, best.covariance) > _INFLUENTIAL_D2
+    if not less.any():
+        return best
     covariance = np.array(best.covariance)
     for row in np.nonzero(less)[0]:
         apart = poses.difference(weighed.T_if_true[row], best.T_slice_model)

@@ -400,7 +400,13 @@ class Tracker:
         if rivals.any():
             others = refined_candidates(model, scene, spots, scale, weighed.matches.subset(rivals))
             return replace(verdict, status="ambiguous", reason="rival_pose", candidates=(best, *others))
-        return replace(verdict, candidates=(covering(model, weighed, best),))
+        best = covering(model, weighed, best)
+        if best.covariance is not verdict.candidates[0].covariance:
+            best = protected(model, scene, best, self.options.registration)
+            limit_mm = self.options.registration.alert_limit_mm
+            if limit_mm is not None and best.protection_mm.max() > limit_mm:
+                return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
+        return replace(verdict, candidates=(best,))
 
     def _straightened(
         self, verdict: Registration, weighed: Weighed, prediction: Prediction, scene: Scene, spots: Spots
@@ -416,12 +422,9 @@ class Tracker:
             return verdict
         best = protected(model, scene, best, options)
         if options.alert_limit_mm is not None and best.protection_mm.max() > options.alert_limit_mm:
-            return replace(verdict, status="no_pose", reason="unprotected", candidates=())
+            return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
         warnings = (
-            (
-                "curved_cost",
-                "the cost is no ellipsoid along its weakest direction; the past settles the pose",
-            ),
+            ("curved_cost", "the cost is no ellipsoid along its weakest direction; the past settles the pose"),
             *fit_warnings(model, spots, best),
         )
         return replace(verdict, status="ok", reason="", candidates=(best,), warnings=warnings)
