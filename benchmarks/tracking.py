@@ -10,10 +10,12 @@ Sequences come from ``tests/tracking/sequences.py``, which shares no code with t
 * the cost of the true match, fitted by SciPy, rises three sd from its lowest point by half to twice of what an
   ellipsoid promises (else no covariance describes what is known);
 * the oracle's odds of the true match exceed 100 : 1 over chance and over every variant (a spot dropped, added, given to
-  another rod, two exchanged) whose pose lies more than 6 sd away. The oracle knows the slice before to 2 mm and
-  2 degrees where the frame did not jump.
+  another rod, two exchanged) whose pose lies more than 6 sd away. The oracle knows where the frame was in the slice
+  before to 2 mm and 2 degrees where it did not jump since; where that slice was neither settled nor decidable, it goes
+  by the last that was, and knows each slice in between 2 mm and 2 degrees worse.
 
-The oracle is asked about every slice that the tracker did not settle, and about every twentieth that it did.
+The oracle is asked about every slice that the tracker did not settle, and about every tenth that it did. Both
+strategies run on the same sequences, and share what the oracle said of a slice.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ BASIN = ((5, 2), (20, 10), (40, 20), (80, 20), (20, 45), (20, 60), (20, 75), (20
 #: sequences between two reports
 REPORT_EVERY = 10
 #: one in so many settled slices is put to the oracle
-SAMPLED = 20
+SAMPLED = 10
+Strategy = Literal["updated", "constant"]
 
 
 @dataclass
@@ -79,12 +82,29 @@ class Tally:
 # --- the oracle -------------------------------------------------------------------------------------------------------
 
 
-def is_decidable(made: Sequence, i: int, sd_px: float) -> bool:
-    """Whether the spots of slice ``i``, and where the frame was before, leave no doubt (see the module's docstring)."""
+class Oracle:
+    """What of a sequence is decidable; every slice is asked about once."""
+
+    def __init__(self, made: Sequence, sd_px: float) -> None:
+        self.made, self.sd_px = made, sd_px
+        self.known: dict[tuple[int, int | None], bool] = {}
+
+    def decidable(self, i: int, settled: list[bool]) -> bool:
+        """Whether slice ``i`` is; ``settled`` says of which slices the tracker was sure."""
+        before = None if i == 0 or self.made.truth[i].has_jumped else i - 1
+        while before is not None and not settled[before] and not self.decidable(before, settled):
+            before = None if before == 0 or self.made.truth[before].has_jumped else before - 1
+        key = (i, before)
+        if key not in self.known:
+            self.known[key] = is_decidable(self.made, i, self.sd_px, before)
+        return self.known[key]
+
+
+def is_decidable(made: Sequence, i: int, sd_px: float, before: int | None) -> bool:
+    """Whether the spots of slice ``i``, and where the frame was in slice ``before``, leave no doubt (see above)."""
     true = made.truth[i]
     if len(true.rods) < DECIDABLE_RODS:
         return False
-    before = None if i == 0 or true.has_jumped else made.truth[i - 1]
     world = _world(made, i, sd_px)
     rods, spots = true.rods, true.spots
     R, t = fitted(made.frame, world, true.R, true.t, rods, spots)
@@ -93,7 +113,8 @@ def is_decidable(made: Sequence, i: int, sd_px: float) -> bool:
         return False
     if not all(LEAST_RISE <= rise <= MOST_RISE for rise in rises(made, world, R, t, rods, spots, own)):
         return False
-    odds = _log_odds(made, world, R, t, rods, spots, before)
+    past = None if before is None else Past(made.truth[before], (i - before) * PAST_SD)
+    odds = _log_odds(made, world, R, t, rods, spots, past)
     if odds < DECIDABLE:
         return False
     information = np.linalg.pinv(own, hermitian=True)
@@ -101,10 +122,18 @@ def is_decidable(made: Sequence, i: int, sd_px: float) -> bool:
         R1, t1 = fitted(made.frame, world, R, t, other_rods, other_spots)
         apart = twist_error(R1, t1, R, t)
         if apart @ information @ apart > WRONG_SD**2:
-            rival = _log_odds(made, world, R1, t1, other_rods, other_spots, before)
+            rival = _log_odds(made, world, R1, t1, other_rods, other_spots, past)
             if rival > odds - DECIDABLE:
                 return False
     return True
+
+
+@dataclass
+class Past:
+    """Where the frame was, and how well that says where it is: sd at its middle, mm and rad."""
+
+    true: TrueSlice
+    sd: np.ndarray
 
 
 def _world(made: Sequence, i: int, sd_px: float) -> OracleScene:
@@ -132,14 +161,18 @@ def _log_odds(
     t: np.ndarray,
     rods: list[int],
     spots: list[int],
-    before: TrueSlice | None,
+    past: Past | None,
 ) -> float:
     """The oracle's odds; where the frame was before takes the place of "anywhere"."""
     odds = oracle_log_odds(made.frame, world, R, t, rods, spots)
-    if before is None:
+    if past is None:
         return odds
-    moved = _about_middle(made, R, t, before.R, before.t) / PAST_SD
-    density = -0.5 * float(moved @ moved) - 3 * math.log(2 * math.pi) - float(np.log(PAST_SD).sum())
+    G = np.eye(6)
+    G[:3] = at_arm(R @ (made.frame.starts.mean(axis=0) + made.frame.ends.mean(axis=0)) / 2)
+    # the prior is averaged over all poses that the spots leave open, not taken at the best of them
+    S = np.diag(past.sd**2) + G @ bound(made.frame, rods, R, t, world.mm_per_px, world.sd_px) @ G.T
+    moved = _about_middle(made, R, t, past.true.R, past.true.t)
+    density = -0.5 * float(moved @ np.linalg.solve(S, moved)) - 0.5 * np.linalg.slogdet(2 * math.pi * S)[1]
     predicted = np.array([cross_line(made.frame.starts[i], made.frame.ends[i], R, t) / world.mm_per_px for i in rods])
     reach = 1.25 * np.linalg.norm(predicted - predicted.mean(axis=0), axis=1).max()
     area = max(math.pi * reach**2, float(np.prod(np.ptp(world.uv_px, axis=0)))) * float(np.prod(world.mm_per_px))
@@ -220,17 +253,24 @@ def rises(
 # --- the experiment ---------------------------------------------------------------------------------------------------
 
 
-def run(seed: int, *, n: int, jacobian: Literal["updated", "constant"], sd_px: float) -> Tally:
-    """One sequence."""
+def run(seed: int, *, n: int, strategies: tuple[Strategy, ...], sd_px: float) -> dict[Strategy, Tally]:
+    """One sequence, with each strategy."""
     made = sequence(seed, n=n, sd_px=sd_px)
+    oracle = Oracle(made, sd_px)
+    return {strategy: run_with(strategy, seed, made, oracle) for strategy in strategies}
+
+
+def run_with(strategy: Strategy, seed: int, made: Sequence, oracle: Oracle) -> Tally:
+    """One sequence with one strategy."""
     tally = Tally()
-    began = time.perf_counter()
-    results = list(pipeline.track(made.slices, made.model, options=TrackingOptions(jacobian=jacobian)))
-    tally.seconds = time.perf_counter() - began
+    began = time.process_time()
+    results = list(pipeline.track(made.slices, made.model, options=TrackingOptions(jacobian=strategy)))
+    tally.seconds = time.process_time() - began
+    settled = [result.status == "ok" for result in results]
     for i, (result, true) in enumerate(zip(results, made.truth, strict=True)):
         tally.counts[f"{result.status}:{result.method or result.reason}"] += 1
         if result.status != "ok":
-            if is_decidable(made, i, sd_px):
+            if oracle.decidable(i, settled):
                 tally.counts["undecided, though decidable"] += 1
                 after = " after a jump" if true.has_jumped else ""
                 tally.counts[f"  with {len(true.rods)} rods{after}: {result.reason}"] += 1
@@ -251,9 +291,9 @@ def run(seed: int, *, n: int, jacobian: Literal["updated", "constant"], sd_px: f
                 f"nees {tally.nees[-1]:.0f} odds {best.log_odds:.1f} bound {beyond} own {own}"
             )
         tally.counts["ok"] += 1
-        if (seed * n + i) % SAMPLED == 0:
+        if (seed * len(results) + i) % SAMPLED == 0:
             tally.counts["sampled"] += 1
-            if is_decidable(made, i, sd_px):
+            if oracle.decidable(i, settled):
                 tally.counts["sampled and decidable"] += 1
                 tally.squares.append(error**2)
                 tally.bounds.append(np.diag(true_bound))
@@ -379,15 +419,17 @@ def main() -> None:
     if a.basin:
         table_basin(a.sequences, a.gain)
         return
-    strategies: tuple[Literal["updated", "constant"], ...] = ("updated", "constant")
-    for jacobian in strategies if a.jacobian == "both" else [s for s in strategies if s == a.jacobian]:
-        total = Tally()
-        job = partial(run, n=a.slices, jacobian=jacobian, sd_px=a.sd)
-        with ProcessPoolExecutor(a.workers) as pool:
-            for done, part in enumerate(pool.map(job, range(a.first, a.first + a.sequences)), 1):
-                total.add(part)
-                if done % REPORT_EVERY == 0 or done == a.sequences:
-                    report(jacobian, done, a.slices, total)
+    strategies: tuple[Strategy, ...] = ("updated", "constant") if a.jacobian == "both" else (a.jacobian,)
+    totals = {strategy: Tally() for strategy in strategies}
+    job = partial(run, n=a.slices, strategies=strategies, sd_px=a.sd)
+    print(f"seeds {a.first} to {a.first + a.sequences - 1}, {a.slices} slices each, spots {a.sd} px", flush=True)
+    with ProcessPoolExecutor(a.workers) as pool:
+        for done, parts in enumerate(pool.map(job, range(a.first, a.first + a.sequences)), 1):
+            for strategy, part in parts.items():
+                totals[strategy].add(part)
+            if done % REPORT_EVERY == 0 or done == a.sequences:
+                for strategy, total in totals.items():
+                    report(strategy, done, a.slices, total)
 
 
 if __name__ == "__main__":

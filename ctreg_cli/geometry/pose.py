@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry.plucker import skew
 
+#: below this an angle is its sine; and the cosine below which half a turn is near
+_SMALL_SINE, _NEARLY_OPPOSITE = 1e-8, -0.9
+
 
 def make_pose(R: FloatArray, t: FloatArray) -> FloatArray:
     """(..., 4, 4) from rotations (..., 3, 3) and translations (..., 3) in mm."""
@@ -50,8 +53,23 @@ def update(T: FloatArray, twist: FloatArray) -> FloatArray:
 
 def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:
     """The twist (6,) with ``update(T_from, twist) == T_to``; mm and rad. ``T_to`` may be a stack (b, 4, 4): (b, 6)."""
-    omega = Rotation.from_matrix(T_to[..., :3, :3] @ T_from[:3, :3].T).as_rotvec()
+    omega = log_rotation(T_to[..., :3, :3] @ T_from[:3, :3].T)
     return np.concatenate([T_to[..., :3, 3] - T_from[:3, 3], omega], axis=-1)
+
+
+def log_rotation(R: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3), no longer than π, of rotations (..., 3, 3): the inverse of :func:`exp_rotation`."""
+    omega = np.empty(R.shape[:-1])
+    omega[..., 0] = R[..., 2, 1] - R[..., 1, 2]
+    omega[..., 1] = R[..., 0, 2] - R[..., 2, 0]
+    omega[..., 2] = R[..., 1, 0] - R[..., 0, 1]
+    sine = 0.5 * np.sqrt((omega * omega).sum(axis=-1))
+    cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
+    if np.any(cosine < _NEARLY_OPPOSITE):  # the axis has to be read off the symmetric part
+        return np.asarray(Rotation.from_matrix(R).as_rotvec())
+    small = sine < _SMALL_SINE
+    omega *= np.where(small, 0.5, 0.5 * np.arctan2(sine, cosine) / np.where(small, 1.0, sine))[..., None]
+    return omega
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:

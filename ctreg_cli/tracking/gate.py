@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.registration.matching import Scene, nearest_assignment
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import Crossing, cross, model_lines
+from ctreg_cli.tracking.single import Crossing, cross, greatest_tolerance_mm, model_lines
 
 #: gates about predicted spots, in sd
 GATE_SD = 4.5
@@ -18,10 +17,18 @@ GATE_SD = 4.5
 _END_SD, _END_SIZES = 4.0, 0.01
 
 
-@lru_cache(maxsize=16)
-def greatest_tolerance_mm(model: RodModel) -> float:
-    """Of any rod; cached, since a model is a value that never changes."""
-    return float(model.tolerances.max())
+def greatest_noise_mm(model: RodModel, scene: Scene) -> float:
+    """A standard deviation of the worst spot about its rod, mm."""
+    S = scene.covariance_mm
+    spot2 = 0.5 * float((S[:, 0, 0] + S[:, 1, 1]).max(initial=0.0))
+    return math.sqrt(spot2 + greatest_tolerance_mm(model) ** 2)
+
+
+def spread(crossing: Crossing, covariance: FloatArray) -> FloatArray:
+    """(n, 2, 2) covariance of crossings that a pose's ``covariance`` (6, 6) makes, mm²."""
+    J = crossing.jacobian
+    result: FloatArray = J @ covariance @ J.transpose(0, 2, 1)
+    return result
 
 
 class Outlook:
@@ -32,53 +39,58 @@ class Outlook:
         self.model, self.scene, self.T = model, scene, T
         self.crossing = crossing or cross(T, model_lines(model))
         self._mm_per_height = self.crossing.mm_per_height()
+        along = self.crossing.lambda_mm
+        #: (n,) along each rod from the crossing to the nearer end; negative beyond it
+        self._to_end_mm = np.minimum(along, model.lengths - along)
         self._slack_mm = self._end_slack_mm()
         self._in_field = self._inside_image()
 
     def _end_slack_mm(self) -> FloatArray:
         """(n,) along each rod."""
-        S = self.scene.covariance_mm
-        spot2 = 0.5 * float((S[:, 0, 0] + S[:, 1, 1]).max(initial=0.0))
-        noise = math.sqrt(spot2 + greatest_tolerance_mm(self.model) ** 2)
-        slack: FloatArray = self._mm_per_height * (self.scene.half_slab_mm + _END_SD * noise)
+        half_slab_mm, noise_mm = self.scene.half_slab_mm, greatest_noise_mm(self.model, self.scene)
+        slack: FloatArray = self._mm_per_height * (half_slab_mm + _END_SD * noise_mm)
         slack += _END_SIZES * self.model.size_mm
         return slack
 
     def _inside_image(self) -> BoolArray | None:
+        """(n,) crossings inside the image; None where all are."""
         field = self.scene.field_mm
         if field is None:
             return None
-        x, y = self.crossing.xy_mm.T
         (left, top), (right, bottom) = field.tolist()
+        xy = self.crossing.xy_mm
+        (x_least, y_least), (x_most, y_most) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
+        if x_least >= left and x_most <= right and y_least >= top and y_most <= bottom:
+            return None
+        x, y = xy.T
         return np.asarray((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
 
     def may_be_seen(self) -> BoolArray:
         """(n,) rods that the slab touches, inside the image."""
-        return self._between(-self._slack_mm)
+        return self._inside(self._to_end_mm >= -self._slack_mm)
 
     def must_be_seen(self) -> BoolArray:
         """(n,) rods that the whole slab cuts, inside the image."""
-        return self._between(self._slack_mm)
+        return self._inside(self._to_end_mm >= self._slack_mm)
 
-    def _between(self, margin_mm: FloatArray) -> BoolArray:
-        along = self.crossing.lambda_mm
-        between: BoolArray = (along >= margin_mm) & (along <= self.model.lengths - margin_mm)
-        return between if self._in_field is None else between & self._in_field
+    def _inside(self, cut: BoolArray) -> BoolArray:
+        return cut if self._in_field is None else cut & self._in_field
 
     def rod_end_shift_mm(self, rods: IntArray) -> float:
         """How far in z a spot may lie off its crossing because one of ``rods`` ends inside the slab, at most; mm."""
         half_slab_mm = self.scene.half_slab_mm
         if half_slab_mm == 0:
             return 0.0
-        along = self.crossing.lambda_mm
-        to_end = np.minimum(along, self.model.lengths - along) / self._mm_per_height
-        return max(0.0, half_slab_mm - float(to_end[rods].min()))
+        return max(0.0, half_slab_mm - float((self._to_end_mm / self._mm_per_height)[rods].min()))
 
-    def assigned(self, covariance: FloatArray) -> IntArray:
-        """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6)."""
-        xy, J = self.scene.xy_mm, self.crossing.jacobian
+    def assigned(self, covariance: FloatArray, spread_mm2: FloatArray | None = None) -> IntArray:
+        """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6).
+
+        ``spread_mm2``: :func:`spread` of the crossings with it, where it has been worked out already.
+        """
+        xy = self.scene.xy_mm
         S = self.scene.covariance_mm
-        G = J @ covariance @ J.transpose(0, 2, 1)
+        G = spread(self.crossing, covariance) if spread_mm2 is None else spread_mm2
         if greatest_tolerance_mm(self.model) > 0:
             k = self.crossing.slope
             G = G + (self.model.tolerances**2)[:, None, None] * (np.eye(2) + k[:, :, None] * k[:, None, :])

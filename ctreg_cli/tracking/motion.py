@@ -10,7 +10,7 @@ space of the pose (``R ← exp([Ω]ₓ) R``, ``c ← c + V``), covariances are 1
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -80,19 +80,34 @@ def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: Fl
 
 def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
-    P = np.array(state.covariance)
-    spread = np.repeat(state.intensity, 3)
-    drifted = spread * dt_s
+    P = state.covariance.copy()
+    spread = (state.intensity * dt_s).tolist()
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
+        drifted = np.array([spread[0], spread[0], spread[0], spread[1], spread[1], spread[1]])
         diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
-        diagonals[_POSE_VELOCITY] += (0.5 * dt_s) * drifted
-        diagonals[_VELOCITY_POSE] += (0.5 * dt_s) * drifted
         diagonals[_VELOCITY] += drifted
-        drifted *= dt_s**2 / 3
-    P.ravel()[_POSE] += drifted + (_LEAST_STEP2 + dt_s * _DOUBT2)
-    return replace(state, T=updated(state.T, dt_s * state.velocity), covariance=P)
+        drifted *= 0.5 * dt_s
+        diagonals[_POSE_VELOCITY] += drifted
+        diagonals[_VELOCITY_POSE] += drifted
+        spread = [dt_s**2 / 3 * part for part in spread]
+    P.ravel()[_POSE] += _grown(spread, dt_s)
+    return MotionState(
+        T=updated(state.T, dt_s * state.velocity),
+        velocity=state.velocity,
+        covariance=P,
+        intensity=state.intensity,
+        information=state.information,
+        elapsed_s=state.elapsed_s,
+    )
+
+
+def _grown(spread: list[float], dt_s: float) -> list[float]:
+    """Variances of the pose after a step: the motion's, and never less than a doubt that grows with time."""
+    return [
+        part + least + dt_s * doubt for part, least, doubt in zip(spread, _LEAST2, _DOUBT2, strict=True) for _ in "xyz"
+    ]
 
 
 def correct(
@@ -126,17 +141,15 @@ def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
 ) -> tuple[FloatArray, FloatArray]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
-    z = S_inverse @ innovation
-    surplus = z * z - S_inverse.diagonal()
+    z, rows = (S_inverse @ innovation).tolist(), S_inverse.tolist()
     intensities, informations = [], []
     for i, (intensity, old) in enumerate(
         zip(predicted.intensity.tolist(), predicted.information.tolist(), strict=True)
     ):
-        part = slice(3 * i, 3 * i + 3)  # translation, then rotation
+        part = range(3 * i, 3 * i + 3)  # translation, then rotation
         share = intensity * (dt_s**3 / 3 if kind == "velocity" else dt_s)
-        score = 0.5 * share * float(surplus[part].sum())
-        block = S_inverse[part, part].ravel()
-        information = MEMORY * old + 0.5 * share**2 * float(block @ block)
+        score = 0.5 * share * sum(z[j] * z[j] - rows[j][j] for j in part)
+        information = MEMORY * old + 0.5 * share**2 * sum(rows[j][k] * rows[j][k] for j in part for k in part)
         log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
         intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]))
         informations.append(information)
@@ -182,6 +195,15 @@ class StillAxes:
         return G if self.T_patient_slice is None else G @ _turned(self.T_patient_slice[:3, :3].T)
 
 
+def inverse_twist(G: FloatArray) -> FloatArray:
+    """The inverse of a (6, 6) made by :meth:`StillAxes.twist`: ``[[R, L], [0, R]]``."""
+    B = np.zeros((6, 6))
+    R_inverse = G[3:, 3:].T
+    B[:3, :3] = B[3:, 3:] = R_inverse
+    B[:3, 3:] = -R_inverse @ G[:3, 3:] @ R_inverse
+    return B
+
+
 def _turned(R: FloatArray) -> FloatArray:
     B = np.zeros((6, 6))
     B[:3, :3] = B[3:, 3:] = R
@@ -195,4 +217,4 @@ def _each_axis(pair: tuple[float, float]) -> FloatArray:
 #: places in a (12, 12) covariance, row by row, of the diagonals of its four blocks
 _POSE, _VELOCITY = slice(0, 72, 13), slice(78, None, 13)
 _POSE_VELOCITY, _VELOCITY_POSE = slice(6, 72, 13), slice(72, 138, 13)
-_LEAST_STEP2, _DOUBT2 = np.square(_each_axis(LEAST_STEP_SD)), np.square(_each_axis(DOUBT_SD))
+_LEAST2, _DOUBT2 = [sd * sd for sd in LEAST_STEP_SD], [sd * sd for sd in DOUBT_SD]

@@ -18,7 +18,17 @@ import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import Crossing, cross, inverse_2x2, inverse_positive, lines_of, solve_positive, updated
+from ctreg_cli.tracking.single import (
+    Crossing,
+    cross,
+    greatest_tolerance_mm,
+    inverse_2x2,
+    inverse_positive,
+    lines_of,
+    model_lines,
+    solve_positive,
+    updated,
+)
 
 #: a step never turns the frame by more than this, rad
 _MAX_TURN_RAD = 0.5
@@ -36,6 +46,9 @@ class ServoOptions:
     spot_tolerance_sd: float = 1e-3
     #: ... or when the spots are this close to the measured ones (rms, in their unit)
     residual_tolerance: float = 1e-9
+    #: a full step of the *updated* law is the last, and taken without looking again, if what it leaves is less than so
+    #: much (sd of all spots together) even when it converges no faster than the step before
+    left_over_sd: float = 0.0
     max_iterations: int = 400
 
 
@@ -64,13 +77,14 @@ class Desired:
         mm_per_px: FloatArray | None = None,
     ) -> Desired:
         """The spots ``uv_px`` (k, 2) of the rods with the indices ``rods`` (k,)."""
+        whole = len(rods) == len(model) and rods.tolist() == list(range(len(model)))
         return cls(
-            lines=lines_of(model, rods),
-            tolerances=model.tolerances[rods],
+            lines=model_lines(model) if whole else lines_of(model, rods),
+            tolerances=model.tolerances if whole else model.tolerances[rods],
             uv_px=uv_px,
             covariance_px=covariance_px,
             mm_per_px=mm_per_px,
-            weight=None if model.tolerances.any() else inverse_2x2(covariance_px),
+            weight=None if greatest_tolerance_mm(model) > 0 else inverse_2x2(covariance_px),
         )
 
 
@@ -89,6 +103,18 @@ class View:
     #: the rods and the slice, mm
     crossing: Crossing
 
+    def stepped(self, twist: FloatArray) -> View:
+        """What is seen after a small twist (6,), to first order in spots and residuals."""
+        shift = (self.jacobian @ twist).reshape(-1, 2)
+        return View(
+            spots_px=self.spots_px + shift,
+            residual_px=self.residual_px - shift,
+            covariance_px=self.covariance_px,
+            weight=self.weight,
+            jacobian=self.jacobian,
+            crossing=self.crossing,
+        )
+
     @property
     def chi2(self) -> float:
         """Σ rᵀ W r."""
@@ -98,8 +124,13 @@ class View:
     @property
     def rms_px(self) -> float:
         """Root mean square of the residuals over both coordinates."""
+        return math.sqrt(self.sum_of_squares_px2 / self.residual_px.size)
+
+    @property
+    def sum_of_squares_px2(self) -> float:
+        """Σ rᵀ r."""
         r = self.residual_px.ravel()
-        return math.sqrt(float(r @ r) / len(r))
+        return float(r @ r)
 
     def weighted(self, jacobian: FloatArray) -> FloatArray:
         """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
@@ -146,6 +177,8 @@ class ServoResult:
     view: View
     #: (6, 6) of the pose error ``[V; Ω]``, mm and rad: the Cramér–Rao bound for *updated*, a little more for *constant*
     covariance: FloatArray
+    #: (6, 6) ``Jᵀ W J`` with the true Jacobian there
+    information: FloatArray
     iterations: int
     converged: bool
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J at the end
@@ -208,16 +241,21 @@ def servo(
     here = view(desired, T, crossing)
     law = _Law.of(here, jacobian)
     path = [(T, here, law.margin(here, model.size_mm))] if keep_path else []
-    iterations = 0
+    iterations, before_sd = 0, 0.0
+    looks_no_more = jacobian is None and options.gain == 1.0 and not keep_path
     while True:
         step, moved_sd2 = law.full_step(here)
         converged = (
             moved_sd2 <= options.spot_tolerance_sd**2
             or max(map(abs, (step * unit).tolist())) <= options.step_tolerance * model.size_mm
-            or here.rms_px <= options.residual_tolerance
+            or here.sum_of_squares_px2 <= options.residual_tolerance**2 * here.residual_px.size
         )
         if converged or iterations >= options.max_iterations:
             break
+        if looks_no_more and moved_sd2 <= options.left_over_sd * before_sd:
+            T, here, iterations, converged = updated(T, step), here.stepped(step), iterations + 1, True
+            break
+        before_sd = math.sqrt(moved_sd2)
         step *= options.gain
         turn = math.sqrt(float(step[3:] @ step[3:]))
         if turn > _MAX_TURN_RAD:
@@ -235,6 +273,7 @@ def servo(
         T=T,
         view=here,
         covariance=law.covariance(here),
+        information=law.information if jacobian is None else here.weighted(here.jacobian).T @ here.jacobian,
         iterations=iterations,
         converged=converged,
         margin=law.margin(here, model.size_mm) if converged else -np.inf,

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf
 
 from ctreg_cli.arrays import FloatArray, IntArray
+from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import MIN_DIRECTION_Z
 from ctreg_cli.rods import RodModel
 
@@ -50,6 +51,12 @@ def lines(starts: FloatArray, directions: FloatArray) -> FloatArray:
 def model_lines(model: RodModel) -> FloatArray:
     """:func:`lines` of all rods of a model; cached, since a model is a value that never changes."""
     return lines(model.starts, model.directions)
+
+
+@lru_cache(maxsize=16)
+def greatest_tolerance_mm(model: RodModel) -> float:
+    """Of any rod; cached, since a model is a value that never changes."""
+    return float(model.tolerances.max())
 
 
 def lines_of(model: RodModel, rods: IntArray) -> FloatArray:
@@ -121,10 +128,12 @@ def updated(T: FloatArray, twist: FloatArray) -> FloatArray:
 
 
 def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:
-    """:func:`ctreg_cli.geometry.pose.difference`; turns of less than half a circle."""
+    """:func:`ctreg_cli.geometry.pose.difference`."""
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = (T_to[:3, :3] @ T_from[:3, :3].T).tolist()
     x, y, z = r21 - r12, r02 - r20, r10 - r01
     sine, cosine = 0.5 * math.sqrt(x * x + y * y + z * z), 0.5 * (r00 + r11 + r22 - 1.0)
+    if cosine < _NEARLY_OPPOSITE:  # the axis has to be read off the symmetric part
+        return poses.difference(T_to, T_from)
     scale = 0.5 if sine < _SMALL_RAD else 0.5 * math.atan2(sine, cosine) / sine
     twist = np.empty(6)
     twist[:3] = T_to[:3, 3] - T_from[:3, 3]
@@ -224,6 +233,8 @@ def _lever() -> FloatArray:
 #: columns of the table that the motion field is made of
 _FEATURES = 10
 _FIELD = _field()
+#: cosine below which half a turn is near
+_NEARLY_OPPOSITE = -0.99
 #: below this an angle's sine is the angle, to double precision
 _SMALL_RAD = 1e-5
 _EYE6 = np.eye(6)

@@ -19,22 +19,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.design.symmetry import symmetries
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import Matches, Scene, doubt, join, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, distinct, doubt, join, observations, search, weigh
+from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
-from ctreg_cli.registration.register import LEAST_MATCHES, decide, least_matches, make_scene
+from ctreg_cli.registration.register import (
+    LEAST_MATCHES,
+    RIVAL_SD,
+    decide,
+    fit_warnings,
+    least_matches,
+    make_scene,
+    protected,
+    refined_candidates,
+)
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
-from ctreg_cli.tracking.gate import GATE_SD, Outlook
-from ctreg_cli.tracking.prior import PastPrior
+from ctreg_cli.tracking.gate import GATE_SD, Outlook, spread
+from ctreg_cli.tracking.prior import PastPrior, Weighed
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.settle import (
+    covering,
+    covering_reconciled,
+    opposing,
+    reconciled,
+    straightened,
+)
 from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
-from ctreg_cli.tracking.variants import covering, with_other_rods, with_twins
+from ctreg_cli.tracking.variants import twins, with_other_rods, with_twins
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -44,11 +60,13 @@ LEAST_MARGIN, MOST_VARIANCE_RATIO = 0.05, 1.1
 #: spots are assigned anew after the servo has moved; by then labels that are right do not change any more
 _ASSIGNMENTS = 3
 #: the servo is done when all spots together move by less than this (sd); right labels never need so many full steps
-_DONE_SD, _MAX_FULL_STEPS = 3e-3, 30
-#: motions that take the rods onto each other as nearly as this (in frame sizes) make a twin worth looking at
-_SYMMETRIC_WITHIN = 0.05
+_DONE_SD, _LEFT_OVER_SD, _MAX_FULL_STEPS = 3e-3, 0.03, 30
 #: poses nearer than this (χ² of six degrees of freedom) at the same moment are of the same slice, read twice
 _SAME_POSE_D2 = 1e-3
+#: a match this near (ln odds, with the past) to one believed without it speaks against it
+_OPPOSED_WITHIN = 7.0
+#: fewer spots than make a pose can still say, with the past, where the frame is: as rivals they count
+_LEAST_WITH_PAST = 3
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
 
@@ -89,7 +107,8 @@ class Prediction:
     #: (n, 2) px, and whether each rod may be seen
     spots_px: FloatArray
     visible: BoolArray
-    #: (n,) radius within which each spot should lie, px
+    #: (n, 2, 2) covariance of the crossings, and the (n,) radius within which each spot should lie, px
+    spread_mm2: FloatArray
     radius_px: FloatArray
     #: the same as a motion, and the time it bridges: s, and slices
     motion: motion.MotionState
@@ -131,10 +150,13 @@ class Tracker:
         #: (n, 2, 6) Ĵ of the constant strategy, mm per mm and rad
         self._kept_jacobian: FloatArray | None = None
         self._is_lost = False
-        self._symmetries = symmetries(model, within_mm=_SYMMETRIC_WITHIN * model.size_mm)
+        self._twins = twins(model)
         gain = self.options.gain
         self._servo_options = ServoOptions(
-            gain=gain, spot_tolerance_sd=_DONE_SD, max_iterations=math.ceil(_MAX_FULL_STEPS / gain)
+            gain=gain,
+            spot_tolerance_sd=_DONE_SD,
+            left_over_sd=_LEFT_OVER_SD,
+            max_iterations=math.ceil(_MAX_FULL_STEPS / gain),
         )
 
     # --- where it should be ------------------------------------------------------------------------------------------
@@ -160,8 +182,8 @@ class Tracker:
         G = axes.slice_twist(T)
         covariance = G @ moved.pose_covariance @ G.T
         crossing = cross(T, model_lines(model))
-        J = crossing.jacobian
-        reach = np.sqrt((J @ covariance * J).sum(axis=2).max(axis=1))
+        spread_mm2 = spread(crossing, covariance)
+        reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
         # how far along a rod that moves the slice
         slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height()
         visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
@@ -172,6 +194,7 @@ class Tracker:
             crossing=crossing,
             spots_px=crossing.xy_mm / s,
             visible=visible,
+            spread_mm2=spread_mm2,
             radius_px=reach * (GATE_SD / min(scale.s_x, scale.s_y)),
             motion=moved,
             dt_s=dt_s,
@@ -274,7 +297,7 @@ class Tracker:
     ) -> tuple[_Followed | None, str]:
         model = self.model
         T, crossing = prediction.T, prediction.crossing
-        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance)
+        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance, prediction.spread_mm2)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -312,6 +335,8 @@ class Tracker:
     def _verified(
         self, prediction: Prediction, scene: Scene, spots: Spots, scale: Scale, followed: _Followed
     ) -> Registration | None:
+        if self._twins and len(scene.xy_mm) > int((followed.spot_of_rod >= 0).sum()) and not self._all_seen(followed):
+            return None  # put the other way round, it might miss no rod and leave no spot
         return verified(
             followed.outlook,
             scale,
@@ -323,6 +348,10 @@ class Tracker:
             self.options.registration,
         )
 
+    def _all_seen(self, followed: _Followed) -> bool:
+        """Whether every rod that must be seen has a spot."""
+        return not (followed.outlook.must_be_seen() & (followed.spot_of_rod < 0)).any()
+
     # --- 2. doubt ----------------------------------------------------------------------------------------------------
 
     def _doubted(
@@ -331,14 +360,14 @@ class Tracker:
         matches = weigh(self.model, scene, followed.servo.T[None], followed.spot_of_rod[None], LEAST_MATCHES)
         if matches is None:
             return None
-        verdict = self._decided(self._rivals(matches, scene, LEAST_MATCHES), prediction, scene, spots, scale)
+        verdict = self._decided(self._rivals(matches, scene, _LEAST_WITH_PAST), prediction, scene, spots, scale)
         if verdict.status != "ok" or not continues(verdict.candidates[0], prediction):
             return None
         return self._straight(verdict, prediction, scene)
 
     def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
         """Matches and all that could be said instead of the best of them."""
-        matches = with_twins(self.model, scene, matches, self._symmetries, least_matches)
+        matches = with_twins(self.model, scene, matches, self._twins, least_matches)
         asked = matches.spot_of_rod[0]
         matches = with_other_rods(self.model, scene, matches, least_matches)
         matches = doubt(self.model, scene, matches, least_matches=least_matches)
@@ -350,12 +379,63 @@ class Tracker:
         self, matches: Matches, prediction: Prediction | None, scene: Scene, spots: Spots, scale: Scale
     ) -> Registration:
         """The verdict on matches weighed with what the past says."""
-        if prediction is not None:
-            matches = PastPrior.of(self.model, scene, prediction).applied(self.model, scene, matches)
-        verdict = decide(self.model, scene, spots, scale, matches, self.options.registration)
+        model = self.model
+        if prediction is None:
+            weighed = Weighed.alone(model, matches)
+        else:
+            weighed = PastPrior.of(model, scene, prediction, self._twins).applied(model, scene, matches)
+        if int((weighed.matches.spot_of_rod[0] >= 0).sum()) < LEAST_MATCHES:
+            return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
+        settled = reconciled(weighed)
+        verdict = decide(model, scene, spots, scale, weighed.matches.subset(~settled), self.options.registration)
+        if verdict.reason == "not_linear" and prediction is not None and len(verdict.candidates) == 1:
+            verdict = self._straightened(verdict, weighed, prediction, scene, spots)
         if verdict.status != "ok":
             return verdict
-        return replace(verdict, candidates=(covering(self.model, matches, verdict.candidates[0]),))
+        if prediction is not None and weighed.near[0] and not continues(verdict.candidates[0], prediction):
+            # it is believed for what lies where the past is, and the spots' own pose is elsewhere
+            return replace(verdict, status="ambiguous", reason="not_linear")
+        best = covering_reconciled(verdict.candidates[0], weighed.subset(settled))
+        rivals = opposing(model, weighed, best)
+        if rivals.any():
+            others = refined_candidates(model, scene, spots, scale, weighed.matches.subset(rivals))
+            return replace(verdict, status="ambiguous", reason="rival_pose", candidates=(best, *others))
+        best = covering(model, weighed, best)
+        if best.covariance is not verdict.candidates[0].covariance:
+            best = protected(model, scene, best, self.options.registration)
+            limit_mm = self.options.registration.alert_limit_mm
+            if limit_mm is not None and best.protection_mm.max() > limit_mm:
+                return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
+        return replace(verdict, candidates=(best,))
+
+    def _straightened(
+        self, verdict: Registration, weighed: Weighed, prediction: Prediction, scene: Scene, spots: Spots
+    ) -> Registration:
+        """A verdict ``not_linear``, or ``ok`` where the past leaves only a straight piece of the valley."""
+        model, options = self.model, self.options.registration
+        best = straightened(model, scene, weighed, verdict.candidates[0], prediction.T, prediction.covariance)
+        if best is None:
+            return verdict
+        seen = observations(scene, weighed.matches.spot_of_rod[:1])
+        covariance, suspicion = covariance_with_misfit(model, best.T_slice_model, best.covariance, seen)
+        if covariance is None or suspicion:
+            return verdict
+        best = protected(model, scene, best, options)
+        if options.alert_limit_mm is not None and best.protection_mm.max() > options.alert_limit_mm:
+            return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
+        warnings = (
+            ("curved_cost", "the cost is no ellipsoid along its weakest direction; the past settles the pose"),
+            *fit_warnings(model, spots, best),
+        )
+        return replace(verdict, status="ok", reason="", candidates=(best,), warnings=warnings)
+
+    def _is_opposed(self, best: Candidate, matches: Matches, prediction: Prediction, scene: Scene) -> bool:
+        """Whether the past speaks for another pose than one that was believed without it."""
+        weighed = PastPrior.of(self.model, scene, prediction, self._twins).applied(self.model, scene, matches)
+        distance2 = weighed.distance2(best.T_slice_model, best.covariance)
+        same = distance2 < _SAME_POSE_D2
+        own = float(weighed.matches.log_odds[same].max(initial=-np.inf))
+        return bool(((weighed.matches.log_odds > own - _OPPOSED_WITHIN) & (distance2 > RIVAL_SD**2)).any())
 
     def _straight(self, verdict: Registration, prediction: Prediction, scene: Scene) -> Registration:
         """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``."""
@@ -384,11 +464,18 @@ class Tracker:
             pool.append(weigh(model, scene, followed.servo.T[None], followed.spot_of_rod[None], least))
         found = [matches for matches in pool if matches is not None]
         if found:
-            matches = self._rivals(join(found), scene, least)
+            # what is looked for must be able to stand alone; what speaks against it need not
+            fewest = LEAST_MATCHES if prediction is None else _LEAST_WITH_PAST
+            matches = self._rivals(join(found), scene, fewest)
+            expected = None if prediction is None else self._expected(prediction, scene)
+            if expected is not None:
+                matches = distinct(model, join([matches, expected]), within=np.inf, most=2 * len(matches))
             verdict = self._decided(matches, prediction, scene, spots, scale)
             if prediction is not None and verdict.status == "no_pose":
-                # nothing where the past expects it: the past is wrong, and the slice stands on its own
-                verdict = self._decided(matches, None, scene, spots, scale)
+                # nothing sure where the past expects it: the past may be wrong, and the slice stands on its own
+                alone = self._decided(matches, None, scene, spots, scale)
+                if alone.status != "ok" or not self._is_opposed(alone.candidates[0], matches, prediction, scene):
+                    verdict = alone
         else:
             reason = "no_consistent_match" if pool else "too_few_spots"
             verdict = Registration(status="no_pose", reason=reason, n_spots=len(spots))
@@ -403,13 +490,20 @@ class Tracker:
             self._is_lost = True
         return self._remember(verdict, "registered", 1.0, prediction if follows_on else None, spots, info, scale)
 
+    def _expected(self, prediction: Prediction, scene: Scene) -> Matches | None:
+        """What the past expects, however little speaks for it."""
+        outlook = Outlook(self.model, scene, prediction.T, prediction.crossing)
+        spot_of_rod = outlook.assigned(prediction.covariance, prediction.spread_mm2)
+        return weigh(self.model, scene, prediction.T[None], spot_of_rod[None], _LEAST_WITH_PAST)
+
     def _lost(self, verdict: Registration, prediction: Prediction | None, scene: Scene) -> Tracked:
         """No sure pose: say so; the past stays only if nothing speaks against it."""
         if prediction is not None:
             agrees = len(scene.xy_mm) < CHECKABLE_MATCHES
             agrees |= any(continues(candidate, prediction) for candidate in verdict.candidates)
             if not agrees:
-                gated = Outlook(self.model, scene, prediction.T, prediction.crossing).assigned(prediction.covariance)
+                outlook = Outlook(self.model, scene, prediction.T, prediction.crossing)
+                gated = outlook.assigned(prediction.covariance, prediction.spread_mm2)
                 agrees = int((gated >= 0).sum()) >= _MATCHES_THAT_AGREE
             self._is_lost = True
             self.miss()
@@ -474,7 +568,7 @@ class Tracker:
             registration=sure,
             method="reacquired" if self._is_lost else method,
             stability=margin,
-            velocity=self._velocity(state, best.T_slice_model, info),
+            velocity=self._velocity(state, G, info),
             begins=prediction is None,
         )
         self._is_lost = False
@@ -489,11 +583,14 @@ class Tracker:
         )
         return tracked
 
-    def _velocity(self, state: motion.MotionState, T_slice_model: FloatArray, info: SliceInfo) -> Velocity | None:
-        """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known."""
+    def _velocity(self, state: motion.MotionState, to_still: FloatArray, info: SliceInfo) -> Velocity | None:
+        """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known.
+
+        ``to_still``: (6, 6) what takes a twist at the model origin in slice axes to the middle's.
+        """
         if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
-        G = self._axes(info).slice_twist(T_slice_model)
+        G = motion.inverse_twist(to_still)
         return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
 
 
@@ -513,8 +610,7 @@ def _unfit(moved: ServoResult) -> str:
     """Why a constant Jacobian is not trusted any more; empty while it is."""
     if moved.margin < LEAST_MARGIN:
         return f"the constant Jacobian's stability margin fell to {moved.margin:.2g}"
-    information = moved.view.weighted(moved.view.jacobian).T @ moved.view.jacobian
-    if float((information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
+    if float((moved.information * moved.covariance).sum()) > 6 * MOST_VARIANCE_RATIO:
         return "the constant Jacobian has become inefficient"
     return ""
 

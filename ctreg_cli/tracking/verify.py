@@ -11,18 +11,26 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
+from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
 from ctreg_cli.registration.integrity import protected_points
 from ctreg_cli.registration.matching import Scene
 from ctreg_cli.registration.options import RegistrationOptions
-from ctreg_cli.registration.register import ACCEPT_LOG_ODDS, INFLATE_P, NEAR_MISS_P, fit_warnings, near_misses_p
+from ctreg_cli.registration.register import (
+    ACCEPT_LOG_ODDS,
+    INFLATE_P,
+    NEAR_MISS_P,
+    WEAK_CONDITION,
+    fit_warnings,
+    near_misses_p,
+)
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -52,6 +60,8 @@ VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
 _MAP_STEPS, _AGREES_D2 = 6, 30.0
 #: nearer than this nothing is seen; farther off, the cost must have risen by this share of what the covariance says
 _NEAR_D2, _LEAST_RISE = 9.0, 0.5
+#: a pose off by more than this, in sd of the spots' information where the past puts the frame, is a surprise
+_SURPRISE_SD = 4.0
 #: innovations beyond this (χ² of six degrees of freedom: 1 in 30,000) are looked into
 _ODD_INNOVATION2 = 30.0
 #: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
@@ -61,6 +71,7 @@ _FIXES_ALONE = 1e-9
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
 _NEIGHBOURHOOD, _LEAST_REACH = 1.25, 1e-3
 _NONE = np.empty(0, dtype=np.intp)
+_Array = TypeVar("_Array", FloatArray, IntArray)
 
 
 def verified(
@@ -96,16 +107,13 @@ def verified(
         return None
     crossings = outlook.crossing
     missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
-    if (
-        not outlook.may_be_seen()[rods].all()
-        or len(missing) > len(rods)
-        or _touching(model, crossings.xy_mm, rods, missing)
-    ):
+    if not outlook.may_be_seen()[rods].all() or len(missing) > len(rods):
         return None
-    if outlook.rod_end_shift_mm(rods) > 0:
+    apart2 = _least_distance2(crossings.xy_mm, rods, missing)
+    if apart2 < _reach_mm(model) ** 2 or outlook.rod_end_shift_mm(rods) > 0:
         return None
     without = LeftOut.of(moved)
-    if without is None or _contested(scene, moved, without, spot_of_rod[rods]):
+    if without is None or _contested(scene, moved, without, spot_of_rod[rods], apart2):
         return None
     protection = without.protection_mm(_protected(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
@@ -121,26 +129,49 @@ def verified(
     residual = seen.residual_px / scale.mm_per_px
     every_residual = residual.ravel()
     best = Candidate(
-        T_slice_model=frozen(T, (4, 4)),
-        covariance=frozen(C, (6, 6)),
-        rod_index=frozen_index(rods),
-        spot_index=frozen_index(spot_of_rod[rods]),
-        residual_px=frozen(residual, (None, 2)),
-        lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
-        missing_rods=frozen_index(missing),
-        missing_px=frozen(crossings.xy_mm[missing] / scale.mm_per_px, (None, 2)),
+        T_slice_model=_kept(T),
+        covariance=_kept(C),
+        rod_index=_kept(rods),
+        spot_index=_kept(spot_of_rod[rods]),
+        residual_px=_kept(residual),
+        lambda_mm=_kept(seen.crossing.lambda_mm),
+        missing_rods=_kept(missing),
+        missing_px=_kept(crossings.xy_mm[missing] / scale.mm_per_px),
         rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
         log_odds=odds,
         iterations=moved.iterations,
-        protection_mm=frozen(protection, (None,)),
+        protection_mm=_kept(protection),
     )
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return None
+    clear = not spots.sd_assumed and _is_strong(model, moved)
     return Registration(
-        status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=fit_warnings(model, spots, best)
+        status="ok",
+        reason="",
+        candidates=(best,),
+        n_spots=len(spots),
+        warnings=() if clear else fit_warnings(model, spots, best),
     )
+
+
+def _kept(values: _Array) -> _Array:
+    """An array that is this verdict's own, from now on read-only."""
+    values.flags.writeable = False
+    return values
+
+
+def _is_strong(model: RodModel, moved: ServoResult) -> bool:
+    """Whether no direction of the pose is known so much worse than another that :func:`fit_warnings` would name it.
+
+    The largest eigenvalue of a covariance is at most its trace, the inverse of the smallest at most that of the
+    information.
+    """
+    variances, informations = moved.covariance.diagonal().tolist(), moved.information.diagonal().tolist()
+    size2 = model.size_mm**2
+    spread = sum(variances[:3]) + size2 * sum(variances[3:])
+    return bool(spread * (sum(informations[:3]) + sum(informations[3:]) / size2) < WEAK_CONDITION**2)
 
 
 def agrees_with_past(
@@ -164,11 +195,24 @@ def agrees_with_past(
         T = poses.update(T, np.asarray(np.linalg.solve(WJ.T @ here.jacobian + information, gradient)))
     apart = poses.difference(T, best.T_slice_model)
     distance2 = float(apart @ np.linalg.solve(best.covariance, apart))
-    if distance2 > _AGREES_D2:
+    there = view(desired, T)
+    information = there.weighted(there.jacobian).T @ there.jacobian
+    if distance2 > _AGREES_D2 or is_surprising(apart, information):
         return False
     # the cost rises from its lowest point by the squared distance, if the covariance describes it
-    rise = view(desired, T).chi2 - best.chi2
+    rise = there.chi2 - best.chi2
     return distance2 < _NEAR_D2 or rise > _LEAST_RISE * distance2
+
+
+def is_surprising(apart: FloatArray, information: FloatArray) -> bool:
+    """Whether a pose off by ``apart`` (6,) is wrong by the ``information`` (6, 6) that the spots have at the true one.
+
+    In place or in rotation. However wide its own covariance: where the past puts the frame, the spots tell so much more
+    that such a pose is none of theirs.
+    """
+    bound = np.linalg.pinv(information, hermitian=True)
+    error2, variance = apart * apart, np.diag(bound)
+    return any(error2[part].sum() > _SURPRISE_SD**2 * variance[part].sum() for part in (slice(3), slice(3, 6)))
 
 
 def _allowed(scene: Scene, T: FloatArray) -> bool:
@@ -198,20 +242,26 @@ def _protected(model: RodModel) -> FloatArray:
     return protected_points(model)
 
 
-def _touching(model: RodModel, xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> bool:
-    """Whether a rod that is seen, or should be, lies on a seen one's crossing: their spots may be one."""
-    x, y = xy_mm.T
-    there = np.concatenate([rods, missing]) if len(missing) else rods
-    d_x, d_y = x[there, None] - x[rods], y[there, None] - y[rods]
-    near = d_x * d_x + d_y * d_y < _reach_mm(model) ** 2
-    return int(np.count_nonzero(near)) > len(rods)  # each lies on itself
+def _least_distance2(xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> float:
+    """Of a rod that is seen, or should be, from the crossing of a seen one, mm²: where it is small, their spots may be
+    one.
+    """
+    x, y = xy_mm.take(rods, axis=0).T
+    there_x, there_y = (x, y) if not len(missing) else xy_mm.take(np.concatenate([rods, missing]), axis=0).T
+    d_x, d_y = there_x[:, None] - x, there_y[:, None] - y
+    d_x *= d_x
+    d_y *= d_y
+    d_x += d_y
+    k = len(rods)
+    d_x.ravel()[: k * k : k + 1] = np.inf  # each lies on itself
+    return float(d_x.min())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeftOut:
     """What the other spots say of each of k spots (the hat matrix of regression: no fit is repeated)."""
 
-    #: (k, 6, 2) ``C Jᵀ`` and (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``
+    #: (6, 2k) ``C Jᵀ`` and (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``
     influence: FloatArray
     left: FloatArray
     #: (k, 2) ``(Σ − J C Jᵀ)⁻¹`` times the residual
@@ -225,31 +275,32 @@ class LeftOut:
     @classmethod
     def of(cls, moved: ServoResult) -> LeftOut | None:
         """None where a spot alone fixes a direction of the pose: the others do not predict it."""
-        own = moved.view.covariance_px
-        J = moved.view.jacobian.reshape(-1, 2, 6)
-        influence = moved.covariance @ J.transpose(0, 2, 1)
-        slack = own - J @ influence
-        alone = determinant_2x2(slack) <= _FIXES_ALONE * determinant_2x2(own)
-        if alone.any() or float(slack[:, 0, 0].min()) <= 0:
+        own, J = moved.view.covariance_px, moved.view.jacobian
+        influence = moved.covariance @ J.T
+        k = len(own)
+        slack = own - J.reshape(k, 2, 6) @ influence.reshape(6, k, 2).transpose(1, 0, 2)
+        slack_det, own_det = determinant_2x2(slack), determinant_2x2(own)
+        if float((slack_det - _FIXES_ALONE * own_det).min()) <= 0 or float(slack[:, 0, 0].min()) <= 0:
             return None
         left = inverse_2x2(slack)
         r = moved.view.residual_px
         pull = (left @ r[:, :, None])[:, :, 0]
-        gate = own @ left @ own
+        # det(Σ L Σ) = det(Σ)² / det(slack)
         return cls(
             influence=influence,
             left=left,
             pull=pull,
             distance2=(pull * r).sum(axis=1),
-            gate=gate,
-            gate_det=determinant_2x2(gate),
+            gate=own @ left @ own,
+            gate_det=own_det * own_det / slack_det,
         )
 
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
         """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
         k, p = len(self.left), len(points)
         G = levers(points @ moved.T[:3, :3].T)
-        moves = G[:, None] @ self.influence  # (p, k, 3, 2)
+        # (p, k, 3, 2)
+        moves = (G.reshape(3 * p, 6) @ self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
         variance = np.empty((p, k + 1, 3, 3))
         variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
         variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
@@ -260,8 +311,11 @@ class LeftOut:
         return np.asarray(level.max(axis=1))
 
 
-def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray) -> bool:
-    """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance."""
+def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray, apart2: float) -> bool:
+    """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance.
+
+    ``apart2``: least squared distance of two of the rods' crossings, mm².
+    """
     if float(without.distance2.max()) > ODD_D2:
         return True
     k = len(spots)
@@ -271,6 +325,12 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
         density = free / float(extent[0] * extent[1])
         if math.pi * ODD_D2 * math.sqrt(float(without.gate_det.max())) * density > CHANCE_IN_GATE:
             return True
+    else:
+        # the rods' own spots: far from each other by more than the widest gate, and what two may lie off
+        widest = CONTEST_D2 * float((without.gate[:, 0, 0] + without.gate[:, 1, 1]).max())
+        off = float(np.abs(moved.view.residual_px).max()) * math.sqrt(2.0)
+        if apart2 > (2.0 * math.sqrt(widest) + off) ** 2:
+            return False
     predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.pull[:, :, None])[:, :, 0]
     d_x, d_y = scene.xy_mm.T[:, None] - predicted.T[:, :, None]  # each (k, m)
     a, b, c = (without.gate[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -294,9 +354,10 @@ def _log_odds(
     centre = there.sum(axis=0) / len(there)
     away = there - centre
     reach2 = max(_NEIGHBOURHOOD**2 * float((away * away).sum(axis=1).max()), (_LEAST_REACH * model.size_mm) ** 2)
-    away = scene.xy_mm - centre
-    n = len(rods)
-    m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
+    m = n = len(rods)
+    if len(scene.xy_mm) > n:
+        away = scene.xy_mm - centre
+        m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
     volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_determinant(S)), 0.0)
     log_weights = float(np.log(determinant_2x2(moved.view.weight)).sum())
     return (

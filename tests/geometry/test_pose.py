@@ -12,6 +12,7 @@ from ctreg_cli.geometry.pose import (
     from_quaternion,
     inverse,
     is_pose,
+    log_rotation,
     make_pose,
     nearest_rotation,
     quaternion,
@@ -48,6 +49,14 @@ def test_update_and_difference_undo_each_other(rng: np.random.Generator) -> None
         np.testing.assert_allclose(update(T, difference(moved, T)), moved, atol=1e-7 if omega @ omega > 9 else 1e-12)
         if np.linalg.norm(omega) < 3:  # at half a turn the axis has two signs
             np.testing.assert_allclose(difference(moved, T), twist, atol=1e-12)
+
+
+def test_log_rotation_agrees_with_scipy(rng: np.random.Generator) -> None:
+    turns = np.concatenate([rotation_vectors(rng), rng.normal(scale=0.7, size=(50, 3))])
+    R = Rotation.from_rotvec(turns).as_matrix()
+    for stack in (R, R[np.linalg.norm(turns, axis=1) < 2.5]):  # with half turns in it, and without
+        np.testing.assert_allclose(log_rotation(stack), Rotation.from_matrix(stack).as_rotvec(), atol=1e-14)
+    np.testing.assert_allclose(log_rotation(R[0]), Rotation.from_matrix(R[0]).as_rotvec(), atol=1e-14)
 
 
 def test_zero_twist_changes_nothing(rng: np.random.Generator) -> None:

@@ -18,8 +18,8 @@ from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.single import cross, model_lines
 from ctreg_cli.tracking.tracker import Tracker
-from tests.oracle import OracleFrame, random_frame
-from tests.tracking.sequences import Sequence, error_of, frame_of, is_wrong, model_of, sequence
+from tests.oracle import OracleFrame, cross_rod, random_frame
+from tests.tracking.sequences import Sequence, TrueSlice, error_of, frame_of, is_wrong, model_of, sequence
 
 CUBE = load_rod_model("rod-cube-30x30x40")
 
@@ -301,6 +301,26 @@ def test_what_is_ambiguous_is_settled_by_a_certain_past_and_only_by_it() -> None
     assert {r.status for r in track(later)[6:]} == {"ambiguous"}
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_frame_put_back_the_other_way_round_is_not_followed_as_if_nothing_were(seed: int) -> None:
+    """All rods but one map onto each other: the old pose misses that rod, leaves one spot, and fits all others."""
+    turn = np.diag([-1.0, -1.0, 1.0])
+    even = half_turned(random_frame(np.random.default_rng(seed), 4))
+    frame = OracleFrame(
+        np.concatenate([even.starts, [[4.0, 1.0, -20.0]]]), np.concatenate([even.ends, [[5.0, 3.0, 20.0]]])
+    )
+    turned = OracleFrame(frame.starts @ turn, frame.ends @ turn)
+    made, after = (
+        sequence(seed, kind="drift", n=14, frame=f, sd_px=0.1, p_missing=0.0, most_false=0) for f in (frame, turned)
+    )
+    made.slices[7:] = after.slices[7:]
+    made.truth[7:] = [replace(true, R=true.R @ turn) for true in after.truth[7:]]
+    results = track(made)
+    assert not wrong(results, made)
+    assert [r.status for r in results[:7]] == ["ok"] * 7
+    assert results[-1].status == "ok"  # at the latest by then the other way round is the more probable
+
+
 def without_rod(made: Sequence, i: int, rod: int) -> SpotSlice:
     """Slice ``i`` without the spot of ``rod``."""
     place = made.frame.starts[rod], made.frame.ends[rod]
@@ -369,8 +389,6 @@ def test_a_table_that_moves_is_taken_out() -> None:
     made = clean("drift", n=2, seed=3)
     true = made.truth[0]
     frame = frame_of(CUBE)
-    from tests.oracle import cross_rod
-
     rng = np.random.default_rng(0)
     slices, truth = [], []
     for i, z in enumerate(np.arange(-8.0, 9.0, 2.0)):
@@ -393,6 +411,37 @@ def test_a_table_that_moves_is_taken_out() -> None:
     last = results[-1].velocity
     assert last is not None
     assert np.abs(last.twist[:3]).max() < 0.5
+
+
+@pytest.mark.parametrize("strategy", ["updated", "constant"])
+def test_rods_enter_and_leave_the_slab(strategy: str) -> None:
+    """A frame whose rods end at different heights sinks through the slice: some end above it, others begin below."""
+    rng = np.random.default_rng(2)
+    whole = random_frame(rng, 10)
+    starts, ends = whole.starts.copy(), whole.ends.copy()
+    along = (whole.ends - whole.starts) / 40.0
+    starts[::3] += 16.0 * along[::3]  # begin at 16 mm of 40
+    ends[1::3] -= 18.0 * along[1::3]  # end at 22 mm
+    frame = OracleFrame(starts, ends)
+    R = Rotation.from_rotvec([0.1, -0.05, 0.4]).as_matrix()
+    slices, truth = [], []
+    for i, z in enumerate(np.linspace(10.0, -10.0, 41)):
+        t = np.array([128.0, 128.0, z])
+        hits = [cross_rod(a, b, R, t) for a, b in zip(starts, ends, strict=True)]
+        rods = [k for k, hit in enumerate(hits) if hit is not None]
+        uv = np.array([hit[0] / 0.5 for hit in hits if hit is not None]) + 0.05 * rng.normal(size=(len(rods), 2))
+        info = SliceInfo(source=str(i), time_s=0.4 * i, scale=Scale(s_x=0.5, s_y=0.5))
+        slices.append(SpotSlice(info=info, spots=Spots.from_points(uv, 0.05)))
+        truth.append(TrueSlice(R=R, t=t, rods=rods, bound=None, has_jumped=False))
+    made = Sequence(frame, model_of(frame), slices, truth)
+    assert len({tuple(true.rods) for true in truth}) >= 5  # rods do come and go
+    results = track(made, jacobian=strategy)
+    assert not wrong(results, made)
+    assert [r.status for r in results].count("ok") >= 39  # where one rod ends beside another, the two may be exchanged
+    for result, true in zip(results, truth, strict=True):
+        if result.status != "ok":
+            continue
+        assert set(result.candidates[0].rod_index.tolist()) <= set(true.rods)
 
 
 def test_the_covariance_is_true() -> None:
