@@ -18,9 +18,9 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.evidence import PosePrior, log_odds
 from ctreg_cli.registration.matching import Matches, Scene, distinct, join, observations, weigh
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
+from ctreg_cli.registration.twins import Twin
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import difference, log_determinant, shifted, solve_positive
-from ctreg_cli.tracking.variants import Twin
 
 #: probability that the frame is moved by hand from one slice to the next, or within a second; the most it may become
 JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5

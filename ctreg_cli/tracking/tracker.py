@@ -36,6 +36,7 @@ from ctreg_cli.registration.register import (
     refined_candidates,
 )
 from ctreg_cli.registration.result import Candidate, Registration
+from ctreg_cli.registration.twins import twins, with_twins
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
@@ -50,7 +51,7 @@ from ctreg_cli.tracking.settle import (
     straightened,
 )
 from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
-from ctreg_cli.tracking.variants import twins, with_other_rods, with_twins
+from ctreg_cli.tracking.variants import with_other_rods
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
@@ -367,7 +368,7 @@ class Tracker:
 
     def _rivals(self, matches: Matches, scene: Scene, least_matches: int) -> Matches:
         """Matches and all that could be said instead of the best of them."""
-        matches = with_twins(self.model, scene, matches, self._twins, least_matches)
+        matches = with_twins(self.model, scene, matches, least_matches)
         asked = matches.spot_of_rod[0]
         matches = with_other_rods(self.model, scene, matches, least_matches)
         matches = doubt(self.model, scene, matches, least_matches=least_matches)

@@ -12,11 +12,11 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.matching import Matches, Scene, join, observations, weigh
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, refined_candidates
+from ctreg_cli.registration.twins import Twin
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import settle
 from ctreg_cli.tracking.prior import PastPrior, Weighed, most_probable
-from ctreg_cli.tracking.variants import Twin
 from tests.oracle import OracleFrame, cross_line, random_frame
 from tests.tracking.sequences import model_of
 
