@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 from scipy.stats import beta
 
+from ctreg_cli.errors import SingularGeometryError
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
@@ -246,7 +247,10 @@ def run_labelled(row: tuple[int, float, int, int]) -> str:
         tilt_rad=0.2,
     ):
         spots = Spots.from_points(world.uv_px, noise)
-        found = register_labelled(spots, world.rod_of_spot, model_of(frame), scale=scale_of(world))
+        try:
+            found = register_labelled(spots, world.rod_of_spot, model_of(frame), scale=scale_of(world))
+        except SingularGeometryError:  # four rods that happen to lie in a plane, and said so
+            continue
         near = [c for c in found if c.chi2 < found[0].chi2 + 2 * DECIDABLE]
         several += len(near) > 1
         best = near[0]
