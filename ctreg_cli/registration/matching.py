@@ -51,6 +51,8 @@ LEAST_CHECKED = 4
 _COVER = 2
 #: ln odds beyond which a match is no chance (10⁹ : 1, Lang et al. 2010): only its own spots can tell another story
 BEYOND_CHANCE = math.log(1e9)
+#: ln odds below which no match is believed; up to so many spots, all rod triples are then tried
+_BELIEVABLE, _FEW_SPOTS = math.log(100), 12
 #: hypotheses a stage hands on to refinement
 _KEEP_PER_STAGE = 40
 #: ... and one that only asks whether a match beyond chance has a rival
@@ -72,6 +74,8 @@ _REPAIRED, _WORTH_REPAIR, _SPOILT_P = 12, 4.0, 1e-4
 _RESTARTS = 20
 #: ... and half of them do for so many matches
 _MANY_MATCHES = 8
+#: starts that are refined, and minima that are weighed
+_MOST_STARTS, _MOST_MINIMA = 48, 8
 #: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
 _VERIFY_STEPS = (12, 6)
 #: spot triples examined at once: as many as stay in the processor's cache
@@ -286,6 +290,11 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
                 best = part.subset(np.array([0]))
                 if best.log_odds[0] > BEYOND_CHANCE:
                     start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
+    if m <= _FEW_SPOTS and done < len(layout.triples) and (best is None or best.log_odds[0] < _BELIEVABLE):
+        # noise can take every root from each of the few triples that hold the rods seen: here all can be afforded
+        part = _search_triples(model, scene, layout.triples[done:], start_from, least_matches, seen)
+        if part is not None:
+            found.append(part)
     if best is not None and best.log_odds[0] > BEYOND_CHANCE:
         second = _second_frame(model, scene, best, least_matches)
         if second is not None:
@@ -738,12 +747,13 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     if len(T) == 0:
         return None
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
-    # most of the starts are far off and say so at once, most of the others after a few steps
-    for kept, iterations in ((40, 2), (12, 6)):
+    # far starts say so at once; the others go on until those of one minimum lie together: on the way down a valley,
+    # a start that will end in a minimum of its own can still be the worse one
+    for kept, iterations in ((_MOST_STARTS, 2), (_MOST_STARTS, 6), (_MOST_MINIMA, 16)):
         T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
-        T = T[np.argsort(fit.chi2, kind="stable")[:kept]]
-        T = T[_distinct_poses(model, T)]
-    return weigh(model, scene, T[:8], np.array(same[: min(len(T), 8)]), least_matches)
+        T = T[np.argsort(fit.chi2, kind="stable")]
+        T = T[_distinct_poses(model, T)[:kept]]
+    return weigh(model, scene, T, np.array(same[: len(T)]), least_matches)
 
 
 def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:

@@ -7,8 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
+from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import LEAST_CHECKED, plan, search
+from ctreg_cli.registration.labelled import register_labelled
+from ctreg_cli.registration.matching import LEAST_CHECKED, doubt, plan, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
@@ -73,3 +75,34 @@ def test_a_field_of_dots_hides_no_frame() -> None:
     assert labels == best.rod_index.tolist()
     off = best.T_slice_model[:3, 3] - world.t
     assert np.linalg.norm(off) < 6 * np.sqrt(np.trace(best.covariance[:3, :3]))
+
+
+@pytest.mark.parametrize("seed", [94, *range(5)])
+def test_few_spots_are_looked_at_from_every_triple(seed: int) -> None:
+    """In the first, noise takes every root from the triples that hold rods seen: the others are then tried too."""
+    rng = np.random.default_rng([864, seed])
+    frame = random_frame(rng, 8)
+    world = some_scene(rng, frame, sd_px=0.1, missing=3, false=4)
+    model = model_of(frame)
+    scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, HALF_MM, options=RegistrationOptions())
+    assert search(model, scene, least_matches=5) is not None, seed
+
+
+@pytest.mark.parametrize("seed", [134, 140, *range(10)])
+def test_every_minimum_of_the_true_match_is_found(seed: int) -> None:
+    """The labelled solver starts elsewhere; what it ends in, doubt must know of (the first two have two minima)."""
+    rng = np.random.default_rng([861, seed])
+    frame = random_frame(rng, 5 + seed % 2)
+    world = some_scene(rng, frame, sd_px=0.3, least=5)
+    model, spots = model_of(frame), Spots.from_points(world.uv_px, 0.3)
+    minima = register_labelled(spots, world.rod_of_spot, model, scale=HALF_MM)
+    scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
+    found = search(model, scene, least_matches=4)
+    assert found is not None, seed
+    found = doubt(model, scene, found, least_matches=4)
+    true = np.full(len(model), -1)
+    true[world.rod_of_spot] = np.arange(len(spots))
+    same = [T for T, match in zip(found.T, found.spot_of_rod, strict=True) if (match == true).all()]
+    for minimum in (m for m in minima if m.chi2 < minima[0].chi2 + 9):
+        turns = [poses.rotation_angle(T[:3, :3] @ minimum.T_slice_model[:3, :3].T) for T in same]
+        assert min(turns) < np.radians(2), seed
