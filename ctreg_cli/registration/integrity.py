@@ -64,6 +64,7 @@ def protection_levels(
         matched=without,
         mm_per_px=seen.mm_per_px,
         half_slab_mm=seen.half_slab_mm,
+        resolved_mm=seen.resolved_mm,
     )
     T_without, fit, _ = refine(model, np.repeat(T[None], n, axis=0), subsets, iterations=6, step_tolerance=1e-6)
     H, _ = fit.normal_equations()

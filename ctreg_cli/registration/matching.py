@@ -82,8 +82,6 @@ _VERIFY_STEPS = (12, 6)
 _CHUNK = 12_000
 #: so many spot triples of one rod triple are worth a call of their own
 _ALONE = 3_000
-#: two crossings nearer than this share of the frame's size may leave one spot, where nothing tells how large spots are
-_UNRESOLVED = 0.02
 #: above this many spots a tree finds the nearest
 _MANY_SPOTS = 32
 
@@ -102,8 +100,8 @@ class Scene:
     half_slab_mm: float = 0.0
     #: (2, 2) lower and upper corner of the image, mm; None: unbounded
     field_mm: FloatArray | None = None
-    #: how near two rods' crossings may come and leave two spots, mm; None: judged by the frame's size
-    resolved_mm: float | None = None
+    #: how near two rods' crossings may come and leave two spots, mm
+    resolved_mm: float = 0.0
 
     def restricted(self, spots: IntArray) -> Scene:
         """The scene with only these spots."""
@@ -599,9 +597,8 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
 
 def _merged(model: RodModel, scene: Scene, crossing_mm: FloatArray, matched: BoolArray, must: BoolArray) -> BoolArray:
     """Rods whose crossing falls on a matched rod's: their two spots may be one, and it has been given away."""
-    reach = scene.resolved_mm if scene.resolved_mm is not None else _UNRESOLVED * model.size_mm
     gap = np.linalg.norm(crossing_mm[:, :, None] - crossing_mm[:, None, :], axis=-1)
-    close = (gap < reach) & matched[:, None, :] & ~np.eye(len(model), dtype=bool)
+    close = (gap < scene.resolved_mm) & matched[:, None, :] & ~np.eye(len(model), dtype=bool)
     merged: BoolArray = close.any(axis=2) & must & ~matched
     return merged
 
@@ -614,6 +611,7 @@ def observations(scene: Scene, spot_of_rod: IntArray) -> Observations:
         matched=spot_of_rod >= 0,
         mm_per_px=np.ones(2),
         half_slab_mm=scene.half_slab_mm,
+        resolved_mm=scene.resolved_mm,
     )
 
 

@@ -36,6 +36,8 @@ class Observations:
     mm_per_px: FloatArray
     #: half the slab's thickness, mm; a rod that ends inside the slab leaves a spot off its crossing
     half_slab_mm: float = 0.0
+    #: two crossings nearer than this may have left one spot, mm (in the unit of ``uv_px × mm_per_px``); 0: never
+    resolved_mm: float = 0.0
 
     def subset(self, rows: IntArray | BoolArray) -> Observations:
         """The hypotheses ``rows`` only."""
@@ -46,6 +48,7 @@ class Observations:
             matched=self.matched[rows],
             mm_per_px=scale,
             half_slab_mm=self.half_slab_mm,
+            resolved_mm=self.resolved_mm,
         )
 
 
@@ -127,6 +130,40 @@ def spot_covariance(
     return result
 
 
+def merged_covariance(
+    model: RodModel, xy_mm: FloatArray, lambda_mm: FloatArray, matched: BoolArray, resolved_mm: float
+) -> FloatArray | None:
+    """Covariance (b, n, 2, 2) in mm² of what a rod without a spot does to the spot of a rod it crosses beside.
+
+    The two may have left one spot, whose centre lies between the crossings: half the gap ``g`` off, ``g gᵀ / 4``. Fully
+    so up to half the distance that two spots need, then less and less; smooth, so that the cost is.
+
+    Args:
+        model: the rods.
+        xy_mm: (b, n, 2) crossings.
+        lambda_mm: (b, n) where along the rods.
+        matched: (b, n) rods with a spot.
+        resolved_mm: how near two crossings may come and leave two spots.
+
+    Returns:
+        The covariances, or None where there are none.
+    """
+    lost = ~matched & (lambda_mm >= 0) & (lambda_mm <= model.lengths)
+    if not lost.any():
+        return None
+    gap = np.where(lost[..., None], xy_mm, np.inf)[:, None] - np.where(matched[..., None], xy_mm, 0.0)[:, :, None]
+    with np.errstate(invalid="ignore"):
+        distance2 = (gap * gap).sum(axis=-1)  # (b, matched, lost)
+    near = np.nonzero((distance2 < resolved_mm**2) & matched[..., None])
+    if len(near[0]) == 0:
+        return None
+    g = gap[near]
+    share = np.clip(2 - 2 * np.sqrt(distance2[near]) / resolved_mm, 0, 1)
+    result = np.zeros((*matched.shape, 2, 2))
+    np.add.at(result, near[:2], (share / 4)[:, None, None] * g[:, :, None] * g[:, None, :])
+    return result
+
+
 def linearise(model: RodModel, T: FloatArray, observations: Observations) -> Linearisation:
     """Residuals, weights and Jacobians of ``b`` hypotheses at poses ``T`` (b, 4, 4)."""
     o = observations
@@ -138,7 +175,12 @@ def linearise(model: RodModel, T: FloatArray, observations: Observations) -> Lin
     shift = None
     if o.half_slab_mm > 0:
         shift = rod_end_shift(model, slope, np.where(used, projection.lambda_mm, 0.5 * model.lengths), o.half_slab_mm)
-    W = invert_2x2(spot_covariance(model, slope, o.covariance_px, o.mm_per_px, shift))
+    covariance = spot_covariance(model, slope, o.covariance_px, o.mm_per_px, shift)
+    if o.resolved_mm > 0:
+        blur = merged_covariance(model, projection.xy_mm, projection.lambda_mm, used, o.resolved_mm)
+        if blur is not None:
+            covariance = covariance + blur / (scale[..., :, None] * scale[..., None, :])
+    W = invert_2x2(covariance)
     W = np.where(used[..., None, None], W, 0.0)
     r = np.where(used[..., None], o.uv_px - predicted, 0.0)
     J = motion_field(T, projection) / scale[..., None]

@@ -61,6 +61,8 @@ _WORTH_SAYING = 1e-3
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
 #: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
 _LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
+#: two crossings nearer than this share of the frame's size may leave one spot, where nothing tells how large spots are
+_UNRESOLVED = 0.04
 #: matches below which nothing can be checked: three spots always fit
 LEAST_MATCHES = 4
 #: spots or rods up to which a match of four is looked for
@@ -109,12 +111,12 @@ def make_scene(
     )
 
 
-def _resolved_mm(spots: Spots, model: RodModel, scale: Scale) -> float | None:
-    """Twice the width of a spot, as it is seen or else as the rods are drawn; None where nothing tells it."""
+def _resolved_mm(spots: Spots, model: RodModel, scale: Scale) -> float:
+    """Twice the width of a spot, as it is seen, or else as the rods are drawn, or a small part of the frame."""
     if len(spots) and np.isfinite(spots.minor_px).all():
         return 2 * float(np.median(spots.minor_px) * scale.mm_per_px.mean())
     diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
-    return 2 * max(diameters) if diameters else None
+    return 2 * max(diameters) if diameters else _UNRESOLVED * model.size_mm
 
 
 def register(
