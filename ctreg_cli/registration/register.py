@@ -37,9 +37,9 @@ ACCEPT_LOG_ODDS = math.log(100)
 ACCEPT_LOG_ODDS_PER_FREE_SPOT, FEW_FREE_SPOTS = 0.12, 6
 #: four matches leave two equations to disagree: what the odds say of them rests on little, and more is asked
 ACCEPT_LOG_ODDS_OF_FOUR = math.log(1e5)
-#: rivals that together come within these ln odds of the best make the slice ambiguous: the contract's 100 : 1 (§5), and
-#: half a nat by which Laplace's method may be off
-RIVAL_LOG_ODDS = math.log(100) + 0.5
+#: rivals that together come within these ln odds of the best make the slice ambiguous (contract §5, where it is said of
+#: one)
+RIVAL_LOG_ODDS = math.log(100)
 #: ... when their poses are farther off than this many standard deviations (contract §5)
 RIVAL_SD = 6.0
 #: translation and rotation in a twist
