@@ -96,6 +96,14 @@ _tilts = np.linspace(0, math.pi / 2, 2001)
 _UPRIGHT_MEAN = float(np.mean(np.exp(-0.5 * (_tilts / _UPRIGHT_SD_RAD) ** 2) * np.sin(_tilts)) * math.pi / 2)
 
 
+def widest_information(size_mm: float) -> FloatArray:
+    """(6, 6) information of the widest that a pose may be: about a frame's size, and a tilt; mm and rad.
+
+    A direction the spots say nothing of is as wide as the prior, not 10⁶.
+    """
+    return np.diag([size_mm**-2.0] * 3 + [_WIDEST_TURN_RAD**-2.0] * 3)
+
+
 def log_odds(
     model: RodModel,
     prior: PosePrior,
@@ -146,9 +154,7 @@ def log_odds(
     field = np.maximum(area, float(extent[0] * extent[1]))
 
     H, _ = fit.normal_equations()
-    # a direction the spots say nothing of is as wide as the prior, not 10⁶: about a frame's size, and a tilt
-    widest = np.diag([model.size_mm**-2.0] * 3 + [_WIDEST_TURN_RAD**-2.0] * 3)
-    _, log_information = np.linalg.slogdet(H + widest)
+    _, log_information = np.linalg.slogdet(H + widest_information(model.size_mm))
     log_prior = prior.log_density(T[:, :3, :3]) - np.log(field * 2 * model.size_mm)
     if log_prior_density is not None:
         log_prior = log_prior_density

@@ -30,7 +30,7 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field
 from ctreg_cli.geometry.plucker import segment_distance_range
 from ctreg_cli.geometry.projection import Projection, project
-from ctreg_cli.registration.evidence import P_SEEN, PosePrior, log_odds
+from ctreg_cli.registration.evidence import P_SEEN, PosePrior, log_odds, widest_information
 from ctreg_cli.registration.minimal import RodTriples, scan_three, solve_three
 from ctreg_cli.registration.refine import (
     Linearisation,
@@ -523,19 +523,25 @@ def _nearest_spots(spots_mm: FloatArray, crossings_mm: FloatArray, taken: IntArr
 
 
 def visibility(
-    model: RodModel, scene: Scene, lambda_mm: FloatArray, slope: FloatArray, xy_mm: FloatArray
+    model: RodModel,
+    scene: Scene,
+    lambda_mm: FloatArray,
+    slope: FloatArray,
+    xy_mm: FloatArray,
+    sd_mm: FloatArray | float = 0.0,
 ) -> tuple[BoolArray, BoolArray]:
     """Which rods *may* leave a spot, and which *must* (..., n).
 
-    Between the two lie rods cut near an end, where only part of the slab holds metal; rods outside the image; and rods
-    whose crossing falls on another's, where two spots become one.
+    Between the two lie rods cut near an end, where only part of the slab holds metal, or as near to it as the pose is
+    known (``sd_mm`` along the rod); and rods outside the image.
     """
     noise = _noise_mm(model, scene)
     with np.errstate(invalid="ignore"):
         per_mm = np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of rod per mm of slab
         slack = scene.half_slab_mm * per_mm + 4 * noise * per_mm + 0.01 * model.size_mm
         may = (lambda_mm >= -slack) & (lambda_mm <= model.lengths + slack)
-        must = (lambda_mm >= slack) & (lambda_mm <= model.lengths - slack)
+        inner = slack + sd_mm
+        must = (lambda_mm >= inner) & (lambda_mm <= model.lengths - inner)
         if scene.field_mm is not None:
             inside = ((xy_mm >= scene.field_mm[0]) & (xy_mm <= scene.field_mm[1])).all(axis=-1)
             may &= inside
@@ -567,7 +573,14 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
         return None
     T, fit, _ = refine(model, T, observations(scene, spot_of_rod), iterations=25, step_tolerance=1e-5)
     projection = project(T, model.starts, model.directions)
-    may, must = visibility(model, scene, projection.lambda_mm, projection.slope, projection.xy_mm)
+    may, must = visibility(
+        model,
+        scene,
+        projection.lambda_mm,
+        projection.slope,
+        projection.xy_mm,
+        _sd_along_rods(model, T, fit, projection),
+    )
     matched = spot_of_rod >= 0
     merged = _merged(model, scene, fit.predicted_px, matched, must)
     must &= ~merged
@@ -593,6 +606,19 @@ def weigh(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray, l
         return None
     matches = Matches(T=T, spot_of_rod=spot_of_rod, log_odds=odds, fit=fit, expected=must)
     return matches.subset(good).subset(np.argsort(-odds[good], kind="stable"))
+
+
+def _sd_along_rods(model: RodModel, T: FloatArray, fit: Linearisation, projection: Projection) -> FloatArray:
+    """Sd (b, n) of where poses cut the rods, mm along the rod: a pose of few spots hardly knows which rods it cuts."""
+    H, _ = fit.normal_equations()
+    C, _ = covariance_from_information(H + widest_information(model.size_mm), model.size_mm)
+    x, y = np.moveaxis(np.nan_to_num(projection.xy_mm - T[:, None, :2, 3]), -1, 0)
+    zero = np.zeros_like(x)
+    height = np.stack([zero, zero, zero + 1, y, -x, zero], axis=-1)  # z part of V + Ω × (Q − t)
+    variance = np.einsum("bni,bij,bnj->bn", height, C, height)
+    per_mm = np.sqrt(1 + (np.nan_to_num(projection.slope) ** 2).sum(axis=-1))
+    result: FloatArray = np.sqrt(np.maximum(variance, 0)) * per_mm
+    return result
 
 
 def _merged(model: RodModel, scene: Scene, crossing_mm: FloatArray, matched: BoolArray, must: BoolArray) -> BoolArray:

@@ -259,20 +259,14 @@ def decide(
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
-    covariance, factor = covariance_along_the_valley(
-        model,
-        best.T_slice_model,
-        best.covariance,
-        _seen_by(model, scene, best),
-        inflation=best.inflation,
-        prior=scene.prior,
-    )
-    if covariance is None:
+    (straight, factor), *variants = (_along_its_valley(model, scene, c) for c in (best, *doubts))
+    doubts = [variant for variant, _ in variants if variant is not None]
+    if straight is None or len(doubts) < len(variants):  # what may well be true must be told too
         return Registration(
             status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
         )
-    if covariance is not best.covariance:
-        best = replace(best, covariance=frozen(covariance, (6, 6)))
+    if straight is not best:
+        best = straight
         warnings.append(
             ("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times")
         )
@@ -303,6 +297,16 @@ def decide(
             warnings=tuple(warnings),
         )
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
+
+
+def _along_its_valley(model: RodModel, scene: Scene, c: Candidate) -> tuple[Candidate | None, float]:
+    """A candidate with a true covariance, None where there is no such; and the factor it was widened by."""
+    covariance, factor = covariance_along_the_valley(
+        model, c.T_slice_model, c.covariance, _seen_by(model, scene, c), inflation=c.inflation, prior=scene.prior
+    )
+    if covariance is None:
+        return None, factor
+    return (c if covariance is c.covariance else replace(c, covariance=frozen(covariance, (6, 6)))), factor
 
 
 def doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
