@@ -78,6 +78,8 @@ _MANY_MATCHES = 8
 _MOST_STARTS, _MOST_MINIMA = 48, 8
 #: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
 _VERIFY_STEPS = (12, 6)
+#: share of a determinant that rounding can feign
+_ROUNDING = 1e-12
 #: spot triples examined at once: as many as stay in the processor's cache
 _CHUNK = 12_000
 #: so many spot triples of one rod triple are worth a call of their own
@@ -478,14 +480,18 @@ def _vote(
     JC = (J.reshape(b, -1, 6) @ np.linalg.inv(information)).reshape(J.shape)
     gate = JC @ np.swapaxes(J, -1, -2) + tolerance[row, others] + np.median(scene.covariance_mm, axis=0)
     r = np.where(hopeful[..., None], scene.xy_mm[nearest] - projection.xy_mm[row, others], 0)
-    det = np.maximum(gate[..., 0, 0] * gate[..., 1, 1] - gate[..., 0, 1] ** 2, 1e-300)
+    product = gate[..., 0, 0] * gate[..., 1, 1]
+    det = product - gate[..., 0, 1] ** 2
+    # of a rod that all but lies in the slice nothing is predicted, and rounding may make its determinant negative
+    known = det > _ROUNDING * product
+    det = np.where(known, det, 1.0)
     distance2 = (
         gate[..., 1, 1] * r[..., 0] ** 2
         - 2 * gate[..., 0, 1] * r[..., 0] * r[..., 1]
         + gate[..., 0, 0] * r[..., 1] ** 2
     ) / det
     spread = np.sqrt(det)
-    votes = hopeful & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
+    votes = hopeful & known & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
     density = len(scene.xy_mm) / max(float(np.prod(np.ptp(scene.xy_mm, axis=0))), 1e-9)
     gain = math.log(P_SEEN) - np.log(2 * math.pi * spread * density) - 0.5 * distance2
     missed = math.log(1 - P_SEEN) * expected[could][row, others]

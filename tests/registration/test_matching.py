@@ -10,7 +10,7 @@ import pytest
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.labelled import register_labelled
-from ctreg_cli.registration.matching import LEAST_CHECKED, doubt, plan, search
+from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, doubt, plan, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
@@ -106,3 +106,27 @@ def test_every_minimum_of_the_true_match_is_found(seed: int) -> None:
     for minimum in (m for m in minima if m.chi2 < minima[0].chi2 + 9):
         turns = [poses.rotation_angle(T[:3, :3] @ minimum.T_slice_model[:3, :3].T) for T in same]
         assert min(turns) < np.radians(2), seed
+
+
+def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
+    rng = np.random.default_rng(866)
+    frame = random_frame(rng, 7)
+    model = model_of(frame)
+    world = some_scene(rng, frame, sd_px=0.1, false=5, least=7)
+    scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, HALF_MM, options=RegistrationOptions())
+    b = 400
+    rods, spots = np.tile([0, 1, 2], (b, 1)), np.tile(np.arange(3), (b, 1))
+    # the last rod turned into the slice's plane but for 10⁻⁴ … 10⁻⁶ rad, and near a spot where it crosses
+    flat = np.array([poses.nearest_rotation(R) for R in rng.normal(size=(b, 3, 3))])
+    along = flat @ model.directions[-1]
+    into = np.cross(along, [0, 0, 1])
+    into /= np.linalg.norm(into, axis=1)[:, None]
+    lift = np.arcsin(along[:, 2]) - 10 ** rng.uniform(-5.9, -4.5, b)
+    R = poses.exp_rotation(-into * lift[:, None]) @ flat
+    middle = (model.starts[-1] + model.ends[-1]) / 2
+    at = np.append(scene.xy_mm[4], 0.0)
+    T = poses.make_pose(R, at - R @ middle)
+    assert (np.abs((T[:, :3, :3] @ model.directions[-1])[:, 2]) < 2e-4).all()
+    score, _, _ = _vote(model, scene, T, rods, spots, 1)
+    assert len(score) > 20, len(score)
+    assert np.isfinite(score).all()
