@@ -67,6 +67,8 @@ _RIVALS_WITHIN = 6.0
 _SECOND_FRAME_LACKS = 2
 #: matches within this many nats of the best are taken apart
 _DOUBT_WITHIN = 7.0
+#: how often doubt may find a better match and take that apart in turn
+_BETTER_FOUND = 2
 #: voted hypotheses looked at for a vote that spoils them, the score they need (ln odds, roughly), and the χ²
 #: probability under which one does
 _REPAIRED, _WORTH_REPAIR, _SPOILT_P = 12, 4.0, 1e-4
@@ -742,24 +744,32 @@ def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int
     """Look for what else explains the spots: other minima of the same matches, and matches that differ in one spot."""
     pool = [matches]
     taken: set[bytes] = set()
+
+    def take_apart(found: Matches, row: int) -> None:
+        taken.add(found.spot_of_rod[row].tobytes())
+        for look in (_restart, _vary):
+            part = look(model, scene, found, row, least_matches)
+            if part is not None:
+                pool.append(part)
+
     for row in range(len(matches)):
-        key = matches.spot_of_rod[row].tobytes()
-        if key in taken:
+        if matches.spot_of_rod[row].tobytes() in taken:
             continue
         if len(taken) >= most or matches.log_odds[row] < matches.log_odds[0] - _DOUBT_WITHIN:
             break
-        taken.add(key)
-        for part in (
-            _restart(model, scene, matches, row, least_matches),
-            _vary(model, scene, matches, row, least_matches),
-        ):
-            if part is not None:
-                pool.append(part)
-    return distinct(model, join(pool))
+        take_apart(matches, row)
+    all_found = distinct(model, join(pool))
+    for _ in range(_BETTER_FOUND):
+        if all_found.spot_of_rod[0].tobytes() in taken:
+            break
+        # a better match than the search's own has had no doubt cast on it yet
+        take_apart(all_found, 0)
+        all_found = distinct(model, join(pool))
+    return all_found
 
 
 def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
-    """The same matches, refined from every root of their triples."""
+    """The same matches, refined from every root of their triples; and what all spots say of the minima found."""
     spot_of_rod = matches.spot_of_rod[row]
     matched = np.nonzero(spot_of_rod >= 0)[0]
     triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
@@ -781,9 +791,12 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     # a start that will end in a minimum of its own can still be the worse one
     for kept, iterations in ((_MOST_STARTS, 2), (_MOST_STARTS, 6), (_MOST_MINIMA, 16)):
         T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
-        T = T[np.argsort(fit.chi2, kind="stable")]
-        T = T[_distinct_poses(model, T)[:kept]]
-    return weigh(model, scene, T, np.array(same[: len(T)]), least_matches)
+        order = np.argsort(fit.chi2, kind="stable")
+        order = order[_distinct_poses(model, T[order])[:kept]]
+        T, fit = T[order], fit.subset(order)
+    # what speaks for another minimum is often a spot that the first one could not use: all vote again
+    T, spot_of_rod = np.concatenate([T, T]), np.concatenate([same[: len(T)], assign(model, scene, T, fit)])
+    return weigh(model, scene, T, spot_of_rod, least_matches)
 
 
 def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:
