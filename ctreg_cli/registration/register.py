@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
+from statistics import median
 
 import numpy as np
 from scipy.special import chdtrc
@@ -113,8 +114,9 @@ def make_scene(
 
 def _resolved_mm(spots: Spots, model: RodModel, scale: Scale) -> float:
     """Twice the width of a spot, as it is seen, or else as the rods are drawn, or a small part of the frame."""
-    if len(spots) and np.isfinite(spots.minor_px).all():
-        return 2 * float(np.median(spots.minor_px) * scale.mm_per_px.mean())
+    widths_px = spots.minor_px.tolist()
+    if widths_px and all(map(math.isfinite, widths_px)):
+        return float(median(widths_px)) * (scale.s_x + scale.s_y)
     diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
     return 2 * max(diameters) if diameters else _UNRESOLVED * model.size_mm
 

@@ -68,7 +68,7 @@ def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: Fl
     full = np.zeros((12, 12))
     full[:6, :6] = covariance
     if kind == "velocity":
-        full.ravel()[_VELOCITY] = np.square(_each_axis(FIRST_VELOCITY_SD))
+        full.ravel()[_VELOCITY] = np.square(_each_axis(*FIRST_VELOCITY_SD))
     return MotionState(
         T=T,
         velocity=np.zeros(6),
@@ -81,18 +81,22 @@ def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: Fl
 def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
     P = state.covariance.copy()
-    spread = (state.intensity * dt_s).tolist()
+    diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
+    place, turn = (state.intensity * dt_s).tolist()
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
-        drifted = np.array([spread[0], spread[0], spread[0], spread[1], spread[1], spread[1]])
-        diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
+        drifted = _each_axis(place, turn)
         diagonals[_VELOCITY] += drifted
         drifted *= 0.5 * dt_s
         diagonals[_POSE_VELOCITY] += drifted
         diagonals[_VELOCITY_POSE] += drifted
-        spread = [dt_s**2 / 3 * part for part in spread]
-    P.ravel()[_POSE] += _grown(spread, dt_s)
+        place, turn = dt_s**2 / 3 * place, dt_s**2 / 3 * turn
+    # never less than a doubt that grows with time
+    diagonals[_POSE] += _each_axis(
+        place + _LEAST2[0] + dt_s * _DOUBT2[0],
+        turn + _LEAST2[1] + dt_s * _DOUBT2[1],
+    )
     return MotionState(
         T=updated(state.T, dt_s * state.velocity),
         velocity=state.velocity,
@@ -101,13 +105,6 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
         information=state.information,
         elapsed_s=state.elapsed_s,
     )
-
-
-def _grown(spread: list[float], dt_s: float) -> list[float]:
-    """Variances of the pose after a step: the motion's, and never less than a doubt that grows with time."""
-    return [
-        part + least + dt_s * doubt for part, least, doubt in zip(spread, _LEAST2, _DOUBT2, strict=True) for _ in "xyz"
-    ]
 
 
 def correct(
@@ -146,10 +143,12 @@ def _learn(
     for i, (intensity, old) in enumerate(
         zip(predicted.intensity.tolist(), predicted.information.tolist(), strict=True)
     ):
-        part = range(3 * i, 3 * i + 3)  # translation, then rotation
+        j, k, l = range(3 * i, 3 * i + 3)  # translation, then rotation
+        trace = rows[j][j] + rows[k][k] + rows[l][l]
+        squares = sum([element * element for row in rows[j : l + 1] for element in row[j : l + 1]])
         share = intensity * (dt_s**3 / 3 if kind == "velocity" else dt_s)
-        score = 0.5 * share * sum(z[j] * z[j] - rows[j][j] for j in part)
-        information = MEMORY * old + 0.5 * share**2 * sum(rows[j][k] * rows[j][k] for j in part for k in part)
+        score = 0.5 * share * (z[j] * z[j] + z[k] * z[k] + z[l] * z[l] - trace)
+        information = MEMORY * old + 0.5 * share**2 * squares
         log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
         intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]))
         informations.append(information)
@@ -210,8 +209,9 @@ def _turned(R: FloatArray) -> FloatArray:
     return B
 
 
-def _each_axis(pair: tuple[float, float]) -> FloatArray:
-    return np.repeat(np.array(pair, dtype=np.float64), 3)
+def _each_axis(place: float, turn: float) -> FloatArray:
+    """(6,) the same along every axis, and the same about every axis."""
+    return np.array([place, place, place, turn, turn, turn])
 
 
 #: places in a (12, 12) covariance, row by row, of the diagonals of its four blocks

@@ -193,6 +193,23 @@ def log_determinant(A: FloatArray) -> float:
     factor, failed = dpotrf(A)
     if failed:
         raise np.linalg.LinAlgError("not positive definite")
+    return _log_determinant_of(factor)
+
+
+def mahalanobis2(x: FloatArray, S: FloatArray) -> tuple[float, float]:
+    """``xᵀ S⁻¹ x`` and ln det S, which one Cholesky factor of the covariance S tells.
+
+    Raises:
+        numpy.linalg.LinAlgError: S is not positive definite.
+    """
+    factor, solved, failed = dposv(S, x)
+    if failed:
+        raise np.linalg.LinAlgError("not positive definite")
+    return float(x @ solved), _log_determinant_of(factor)
+
+
+def _log_determinant_of(factor: FloatArray) -> float:
+    """ln det of the matrix with this Cholesky factor."""
     return 2.0 * sum(map(math.log, factor.diagonal().tolist()))
 
 

@@ -298,7 +298,8 @@ class Tracker:
     ) -> tuple[_Followed | None, str]:
         model = self.model
         T, crossing = prediction.T, prediction.crossing
-        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance, prediction.spread_mm2)
+        outlook = Outlook(model, scene, T, crossing)
+        spot_of_rod = outlook.assigned(prediction.covariance, prediction.spread_mm2)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -321,9 +322,9 @@ class Tracker:
             if not moved.converged:
                 return None, "the servo did not converge"
             T = moved.T
-            outlook = Outlook(model, scene, T, moved.view.crossing if all_seen else None)
+            outlook = Outlook(model, scene, T, moved.view.crossing if all_seen else None, outlook.noise_mm)
             crossing = outlook.crossing
-            if all_seen and len(rods) == len(scene.xy_mm) and moved.view.chi2 < GATE_SD**2:
+            if all_seen and len(rods) == len(scene.xy_mm) and moved.chi2 < GATE_SD**2:
                 break  # no rod or spot is left over, and none can be outside its gate
             again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):

@@ -42,7 +42,7 @@ from ctreg_cli.tracking.single import (
     inverse_2x2,
     levers,
     log_determinant,
-    solve_positive,
+    mahalanobis2,
     turned_by,
 )
 
@@ -100,7 +100,7 @@ def verified(
     seen, T, C = moved.view, moved.T, moved.covariance
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
-    chi2 = seen.chi2
+    chi2 = moved.chi2
     if len(rods) < CHECKABLE_MATCHES or float(chdtrc(dof, chi2)) < INFLATE_P or not _allowed(scene, T):
         return None
     if _is_vaguer(C, VAGUE_POSE_RAD) or _is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
@@ -118,12 +118,10 @@ def verified(
     protection = without.protection_mm(_protected(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
         return None
-    innovation = difference(T, T_predicted)
-    S = predicted_covariance + C
-    distance2 = float(innovation @ solve_positive(S, innovation))
-    if distance2 > _ODD_INNOVATION2:
+    innovation = mahalanobis2(difference(T, T_predicted), predicted_covariance + C)
+    if innovation[0] > _ODD_INNOVATION2:
         return None
-    odds = _log_odds(model, scene, crossings.xy_mm, moved, chi2, rods, missing, distance2, S)
+    odds = _log_odds(model, scene, crossings.xy_mm, moved, rods, missing, innovation)
     if not odds > ACCEPT_LOG_ODDS:
         return None
     residual = seen.residual_px / scale.mm_per_px
@@ -305,10 +303,16 @@ class LeftOut:
         variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
         variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
         level = np.sqrt(np.linalg.eigvalsh(variance)[..., -1])
-        level *= math.sqrt(float(chdtri(3, risk / (k + 1))))
+        level *= _sd_at_risk(risk, k)
         separation = moves @ self.pull[:, :, None]
         level[:, :k] += np.sqrt((separation * separation).sum(axis=(2, 3)))
         return np.asarray(level.max(axis=1))
+
+
+@lru_cache(maxsize=64)
+def _sd_at_risk(risk: float, n_matches: int) -> float:
+    """The K of :mod:`~ctreg_cli.registration.integrity`: how many sd of a target's error the ``risk`` allows."""
+    return math.sqrt(float(chdtri(3, risk / (n_matches + 1))))
 
 
 def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray, apart2: float) -> bool:
@@ -343,13 +347,14 @@ def _log_odds(
     scene: Scene,
     xy_mm: FloatArray,
     moved: ServoResult,
-    chi2: float,
     rods: IntArray,
     missing: IntArray,
-    distance2: float,
-    S: FloatArray,
+    innovation: tuple[float, float],
 ) -> float:
-    """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone."""
+    """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone.
+
+    ``innovation``: squared distance from the prediction, and ln det of its covariance.
+    """
     there = xy_mm.take(np.concatenate([rods, missing]) if len(missing) else rods, axis=0)
     centre = there.sum(axis=0) / len(there)
     away = there - centre
@@ -358,13 +363,14 @@ def _log_odds(
     if len(scene.xy_mm) > n:
         away = scene.xy_mm - centre
         m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
-    volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_determinant(S)), 0.0)
+    distance2, log_det = innovation
+    volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_det), 0.0)
     log_weights = float(np.log(determinant_2x2(moved.view.weight)).sum())
     return (
         volume
         + n * (math.log(P_SEEN) - math.log(2 * math.pi))
         + 0.5 * log_weights
-        - 0.5 * chi2
+        - 0.5 * moved.chi2
         + n * math.log(math.pi * reach2)
         + math.lgamma(m - n + 0.5)
         - math.lgamma(m + 0.5)
