@@ -47,12 +47,11 @@ class Outlook:
         self.model, self.scene, self.T = model, scene, T
         self.crossing = crossing or cross(T, model_lines(model))
         self.noise_mm = greatest_noise_mm(model, scene) if noise_mm is None else noise_mm
-        self._mm_per_height = self.crossing.mm_per_height()
         along = self.crossing.lambda_mm
         #: (n,) along each rod from the crossing to the nearer end; negative beyond it
         self._to_end_mm = np.minimum(along, model.lengths - along)
         #: (n,) along each rod
-        self._slack_mm = self._mm_per_height * (scene.half_slab_mm + _END_SD * self.noise_mm)
+        self._slack_mm = self.crossing.mm_per_height * (scene.half_slab_mm + _END_SD * self.noise_mm)
         self._slack_mm += _END_SIZES * model.size_mm
         self._in_field = self._inside_image()
 
@@ -84,7 +83,7 @@ class Outlook:
         half_slab_mm = self.scene.half_slab_mm
         if half_slab_mm == 0:
             return 0.0
-        return max(0.0, half_slab_mm - float((self._to_end_mm / self._mm_per_height)[rods].min()))
+        return max(0.0, half_slab_mm - float((self._to_end_mm / self.crossing.mm_per_height)[rods].min()))
 
     def assigned(self, covariance: FloatArray, spread_mm2: FloatArray | None = None) -> IntArray:
         """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6).
@@ -97,9 +96,8 @@ class Outlook:
         if greatest_tolerance_mm(self.model) > 0:
             k = self.crossing.slope
             G = G + (self.model.tolerances**2)[:, None, None] * (np.eye(2) + k[:, :, None] * k[:, None, :])
-        a, b, c = (G[:, i, j, None] + S[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        d = xy.T[:, None] - self.crossing.xy_mm.T[:, :, None]  # (2, n, m)
-        d_x, d_y = d
+        a, b, _, c = G.reshape(-1, 4).T[:, :, None] + S.reshape(-1, 4).T[:, None]  # each (n, m)
+        d_x, d_y = xy.T[:, None] - self.crossing.xy_mm.T[:, :, None]
         distance2 = (c * d_x - (b + b) * d_y) * d_x + a * d_y * d_y
         inside = distance2 < GATE_SD**2 * (a * c - b * b)
         inside &= self.may_be_seen()[:, None]

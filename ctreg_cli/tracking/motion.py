@@ -44,9 +44,9 @@ class MotionState:
     velocity: FloatArray
     #: (12, 12) of pose and velocity
     covariance: FloatArray
-    #: (2,) intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
-    intensity: FloatArray
-    information: FloatArray
+    #: intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
+    intensity: tuple[float, float]
+    information: tuple[float, float]
     #: time that the motion has been watched for
     elapsed_s: float = 0.0
 
@@ -56,14 +56,16 @@ class MotionState:
         return self.covariance[:6, :6]
 
 
-def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: FloatArray | None = None) -> MotionState:
+def start(
+    T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: tuple[float, float] = FIRST_INTENSITY
+) -> MotionState:
     """The motion of a frame seen once.
 
     Args:
         T: (4, 4) its pose, origin in the middle.
         covariance: (6, 6) of it.
         kind: ``velocity``, or ``identity``: the frame stays where it is but for chance.
-        intensity: (2,) what was learnt of the motion before.
+        intensity: what was learnt of the motion before.
     """
     full = np.zeros((12, 12))
     full[:6, :6] = covariance
@@ -73,8 +75,8 @@ def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: Fl
         T=T,
         velocity=np.zeros(6),
         covariance=full,
-        intensity=np.array(FIRST_INTENSITY) if intensity is None else intensity,
-        information=np.zeros(2),
+        intensity=intensity,
+        information=(0.0, 0.0),
     )
 
 
@@ -82,7 +84,7 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
     P = state.covariance.copy()
     diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
-    place, turn = (state.intensity * dt_s).tolist()
+    place, turn = dt_s * state.intensity[0], dt_s * state.intensity[1]
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
@@ -136,13 +138,11 @@ def correct(
 
 def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
     z, rows = (S_inverse @ innovation).tolist(), S_inverse.tolist()
-    intensities, informations = [], []
-    for i, (intensity, old) in enumerate(
-        zip(predicted.intensity.tolist(), predicted.information.tolist(), strict=True)
-    ):
+    pair = []
+    for i, (intensity, old) in enumerate(zip(predicted.intensity, predicted.information, strict=True)):
         j, k, l = range(3 * i, 3 * i + 3)  # translation, then rotation
         trace = rows[j][j] + rows[k][k] + rows[l][l]
         squares = sum([element * element for row in rows[j : l + 1] for element in row[j : l + 1]])
@@ -150,9 +150,9 @@ def _learn(
         score = 0.5 * share * (z[j] * z[j] + z[k] * z[k] + z[l] * z[l] - trace)
         information = MEMORY * old + 0.5 * share**2 * squares
         log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
-        intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]))
-        informations.append(information)
-    return np.array(intensities), np.array(informations)
+        pair.append((min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]), information))
+    (of_place, known_of_place), (of_turn, known_of_turn) = pair
+    return (of_place, of_turn), (known_of_place, known_of_turn)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -28,18 +28,14 @@ class Crossing(NamedTuple):
     lambda_mm: FloatArray
     #: (n, 2) ``d_xy / d_z``
     slope: FloatArray
+    #: (n,) millimetres along each rod for one along the slice normal: ``1 / |d_z|``
+    mm_per_height: FloatArray
     #: (n, 2, 6) motion field, mm per mm and rad
     jacobian: FloatArray
 
-    def mm_per_height(self) -> FloatArray:
-        """(n,) millimetres along each rod for one along the slice normal."""
-        k_x, k_y = self.slope.T
-        length: FloatArray = np.sqrt(k_x * k_x + k_y * k_y + 1.0)
-        return length
-
 
 def lines(starts: FloatArray, directions: FloatArray) -> FloatArray:
-    """(4, 2n) rods as homogeneous columns: n points (n, 3), then n directions (n, 3)."""
+    """(4, 2n) rods as homogeneous columns: n points (n, 3), then n unit directions (n, 3)."""
     n = len(starts)
     columns = np.zeros((4, 2 * n))
     columns[:3, :n], columns[:3, n:] = starts.T, directions.T
@@ -87,7 +83,14 @@ def cross(T: FloatArray, columns: FloatArray) -> Crossing:
     q = np.subtract(xy, T[:2, 3:], out=features[2:4])
     np.multiply(slope[:, None], q, out=features[4:8].reshape(2, 2, n))
     features[8], features[9] = 1.0, -T[2, 3]
-    return Crossing(xy_mm=xy.T, lambda_mm=a_z / -d_z, slope=slope.T, jacobian=(features.T @ _FIELD).reshape(n, 2, 6))
+    mm_per_dz = -1.0 / d_z
+    return Crossing(
+        xy_mm=xy.T,
+        lambda_mm=a_z * mm_per_dz,
+        slope=slope.T,
+        mm_per_height=np.abs(mm_per_dz),
+        jacobian=(features.T @ _FIELD).reshape(n, 2, 6),
+    )
 
 
 def _field() -> FloatArray:
@@ -213,17 +216,20 @@ def _log_determinant_of(factor: FloatArray) -> float:
     return 2.0 * sum(map(math.log, factor.diagonal().tolist()))
 
 
-def inverse_2x2(matrices: FloatArray) -> FloatArray:
-    """Inverses of (k, 2, 2) matrices."""
+def inverse_2x2(matrices: FloatArray, determinants: FloatArray | None = None) -> FloatArray:
+    """Inverses of (k, 2, 2) matrices; ``determinants`` (k,) where they have been worked out already."""
+    if determinants is None:
+        determinants = determinant_2x2(matrices)
     adjugate = matrices.reshape(-1, 4).take(_ADJUGATE, axis=1)
     adjugate *= _ADJUGATE_SIGN
-    adjugate /= determinant_2x2(matrices)[:, None]
+    adjugate /= determinants[:, None]
     return adjugate.reshape(-1, 2, 2)
 
 
 def determinant_2x2(matrices: FloatArray) -> FloatArray:
     """(k,) determinants of (k, 2, 2) matrices."""
-    determinant: FloatArray = matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
+    a, b, c, d = matrices.reshape(-1, 4).T
+    determinant: FloatArray = a * d - b * c
     return determinant
 
 

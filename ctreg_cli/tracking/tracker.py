@@ -186,7 +186,7 @@ class Tracker:
         spread_mm2 = spread(crossing, covariance)
         reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
         # how far along a rod that moves the slice
-        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height()
+        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height
         visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
         s = scale.mm_per_px
         return Prediction(
@@ -559,7 +559,7 @@ class Tracker:
                 time_s = past.time_s + prediction.dt_s
         timed = past is not None and (past.time_s is None) == (time_s is None)
         if prediction is None or not timed:
-            learnt = past.motion.intensity if past is not None and timed else None
+            learnt = past.motion.intensity if past is not None and timed else motion.FIRST_INTENSITY
             state = motion.start(T, C, kind, learnt)
         else:
             innovation = difference(T, prediction.motion.T)

@@ -9,9 +9,8 @@ sure; with one it is not refused, but looked into (:mod:`~ctreg_cli.tracking.tra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -121,7 +120,7 @@ def verified(
     innovation = mahalanobis2(difference(T, T_predicted), predicted_covariance + C)
     if innovation[0] > _ODD_INNOVATION2:
         return None
-    odds = _log_odds(model, scene, crossings.xy_mm, moved, rods, missing, innovation)
+    odds = _log_odds(model, scene, crossings.xy_mm, moved, without, rods, missing, innovation)
     if not odds > ACCEPT_LOG_ODDS:
         return None
     residual = seen.residual_px / scale.mm_per_px
@@ -255,8 +254,7 @@ def _least_distance2(xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> fl
     return float(d_x.min())
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LeftOut:
+class LeftOut(NamedTuple):
     """What the other spots say of each of k spots (the hat matrix of regression: no fit is repeated)."""
 
     #: (6, 2k) ``C Jᵀ`` and (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``
@@ -266,9 +264,10 @@ class LeftOut:
     pull: FloatArray
     #: (k,) squared distance of each spot from where the others predict it, in sd
     distance2: FloatArray
-    #: (k, 2, 2) covariance of that prediction and the spot, and its determinant
+    #: (k, 2, 2) covariance of that prediction and the spot, and its determinant; and that of the spot's own covariance
     gate: FloatArray
     gate_det: FloatArray
+    own_det: FloatArray
 
     @classmethod
     def of(cls, moved: ServoResult) -> LeftOut | None:
@@ -278,9 +277,9 @@ class LeftOut:
         k = len(own)
         slack = own - J.reshape(k, 2, 6) @ influence.reshape(6, k, 2).transpose(1, 0, 2)
         slack_det, own_det = determinant_2x2(slack), determinant_2x2(own)
-        if float((slack_det - _FIXES_ALONE * own_det).min()) <= 0 or float(slack[:, 0, 0].min()) <= 0:
+        if min((slack_det - _FIXES_ALONE * own_det).tolist()) <= 0 or min(slack[:, 0, 0].tolist()) <= 0:
             return None
-        left = inverse_2x2(slack)
+        left = inverse_2x2(slack, slack_det)
         r = moved.view.residual_px
         pull = (left @ r[:, :, None])[:, :, 0]
         # det(Σ L Σ) = det(Σ)² / det(slack)
@@ -291,6 +290,7 @@ class LeftOut:
             distance2=(pull * r).sum(axis=1),
             gate=own @ left @ own,
             gate_det=own_det * own_det / slack_det,
+            own_det=own_det,
         )
 
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
@@ -320,7 +320,7 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
 
     ``apart2``: least squared distance of two of the rods' crossings, mm².
     """
-    if float(without.distance2.max()) > ODD_D2:
+    if max(without.distance2.tolist()) > ODD_D2:
         return True
     k = len(spots)
     free = len(scene.xy_mm) - k
@@ -331,8 +331,8 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
             return True
     else:
         # the rods' own spots: far from each other by more than the widest gate, and what two may lie off
-        widest = CONTEST_D2 * float((without.gate[:, 0, 0] + without.gate[:, 1, 1]).max())
-        off = float(np.abs(moved.view.residual_px).max()) * math.sqrt(2.0)
+        widest = CONTEST_D2 * max((without.gate[:, 0, 0] + without.gate[:, 1, 1]).tolist())
+        off = max(map(abs, moved.view.residual_px.ravel().tolist())) * math.sqrt(2.0)
         if apart2 > (2.0 * math.sqrt(widest) + off) ** 2:
             return False
     predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.pull[:, :, None])[:, :, 0]
@@ -347,6 +347,7 @@ def _log_odds(
     scene: Scene,
     xy_mm: FloatArray,
     moved: ServoResult,
+    without: LeftOut,
     rods: IntArray,
     missing: IntArray,
     innovation: tuple[float, float],
@@ -358,14 +359,14 @@ def _log_odds(
     there = xy_mm.take(np.concatenate([rods, missing]) if len(missing) else rods, axis=0)
     centre = there.sum(axis=0) / len(there)
     away = there - centre
-    reach2 = max(_NEIGHBOURHOOD**2 * float((away * away).sum(axis=1).max()), (_LEAST_REACH * model.size_mm) ** 2)
+    reach2 = max(_NEIGHBOURHOOD**2 * max((away * away).sum(axis=1).tolist()), (_LEAST_REACH * model.size_mm) ** 2)
     m = n = len(rods)
     if len(scene.xy_mm) > n:
         away = scene.xy_mm - centre
         m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
     distance2, log_det = innovation
     volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_det), 0.0)
-    log_weights = float(np.log(determinant_2x2(moved.view.weight)).sum())
+    log_weights = -sum(map(math.log, without.own_det.tolist()))
     return (
         volume
         + n * (math.log(P_SEEN) - math.log(2 * math.pi))
