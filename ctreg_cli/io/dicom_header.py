@@ -25,7 +25,7 @@ from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian
 from pydicom.valuerep import VR
 from pydicom.values import convert_SQ
 
-from ctreg_cli.io.dicom_plain import HEAD_BYTES, PlainHeader, read_plain
+from ctreg_cli.io.dicom_plain import HEAD_BYTES, read_plain
 
 #: what is read of a header, top level; all else is stepped over
 _TOP_LEVEL = (
@@ -263,9 +263,9 @@ def read_header(file: BinaryIO, size: int) -> Header:
     """
     notes: list[str] = []
     head = file.read(HEAD_BYTES)
-    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    plain = plain_header(head, size)
     if plain is not None:
-        return _as_header(plain, size)
+        return plain
     head = head[: PREAMBLE_BYTES + 4]
     file.seek(len(head))
     if head[PREAMBLE_BYTES:] != MAGIC:
@@ -308,7 +308,11 @@ def read_header(file: BinaryIO, size: int) -> Header:
     )
 
 
-def _as_header(plain: PlainHeader, size: int) -> Header:
+def plain_header(head: bytes, size: int) -> Header | None:
+    """The header of a file of ``size`` bytes from its first :data:`HEAD_BYTES`; None where it is not plain."""
+    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    if plain is None:
+        return None
     return Header(
         elements=Elements(plain.elements, True),
         meta=Elements(plain.meta, True),
