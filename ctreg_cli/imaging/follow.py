@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,7 +179,7 @@ class Follower:
         centre = middles + fitted.centre.T
         off = _length(centre - uv)
         good &= off <= radius
-        good &= (_length(centre[:, None] - centre) <= RADIUS_PX).sum(axis=1) == 1  # each is near itself
+        good &= np.count_nonzero(_length(centre[:, None] - centre) <= RADIUS_PX, axis=1) == 1  # each is near itself
         beyond = off + radius > RADIUS_PX
         if beyond.any():  # the windows do not show all that was to be looked at
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
@@ -319,8 +319,7 @@ _OF_EACH = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Region:
+class _Region(NamedTuple):
     """What of ``k`` windows lies above half height."""
 
     own: BoolArray
@@ -347,8 +346,7 @@ class _Region:
         return np.asarray(same)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Looks:
+class _Looks(NamedTuple):
     """What fits left: mean squares (k,) of the weighted residuals, and the greatest residual (k,) beside each spot."""
 
     height: FloatArray
@@ -461,8 +459,7 @@ def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:
     return np.asarray(shift[:, 0, 0] * along_u + shift[:, 1, 1] * along_v)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Windows:
+class _Windows(NamedTuple):
     """The pixels of a slice, spots upright; only integers, so that each is a value."""
 
     #: the image in one line

@@ -20,7 +20,7 @@ from ctreg_cli.registration.matching import Matches, Scene, distinct, join, obse
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.registration.twins import Twin
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import difference, mahalanobis2, shifted
+from ctreg_cli.tracking.single import carried, difference, mahalanobis2, shifted
 
 #: probability that the frame is moved by hand from one slice to the next, or within a second; the most it may become
 JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5
@@ -143,7 +143,7 @@ class PastPrior:
 def _turned_over(prediction: Predicted, twin: Twin) -> tuple[FloatArray, FloatArray]:
     """The predicted pose (4, 4) of the frame with the motion of a twin done to it, and its (6, 6) covariance."""
     G = shifted(prediction.T[:3, :3] @ twin.transform[:3, 3])
-    return prediction.T @ twin.transform, G @ prediction.covariance @ G.T
+    return prediction.T @ twin.transform, carried(G, prediction.covariance)
 
 
 def _log_normal(x: FloatArray, S: FloatArray) -> float:

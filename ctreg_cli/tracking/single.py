@@ -243,6 +243,12 @@ def shifted(lever_mm: FloatArray) -> FloatArray:
     return G
 
 
+def carried(G: FloatArray, covariance: FloatArray) -> FloatArray:
+    """``G C Gᵀ``: a covariance (6, 6) of twists that ``G`` (6, 6) takes elsewhere; ``dot`` costs half of ``@`` here."""
+    result: FloatArray = G.dot(covariance).dot(G.T)
+    return result
+
+
 def levers(points_mm: FloatArray) -> FloatArray:
     """(p, 3, 6) how a twist moves points (p, 3), seen from the model origin: ``V + Ω × point``."""
     return (points_mm @ _LEVER + _SHIFT).reshape(-1, 3, 6)

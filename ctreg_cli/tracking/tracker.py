@@ -50,7 +50,7 @@ from ctreg_cli.tracking.settle import (
     reconciled,
     straightened,
 )
-from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
+from ctreg_cli.tracking.single import Crossing, carried, cross, difference, model_lines
 from ctreg_cli.tracking.variants import with_other_rods
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
@@ -181,7 +181,7 @@ class Tracker:
         axes = self._axes(info)
         T = axes.slice_pose(moved.T)
         G = axes.slice_twist(T)
-        covariance = G @ moved.pose_covariance @ G.T
+        covariance = carried(G, moved.pose_covariance)
         crossing = cross(T, model_lines(model))
         spread_mm2 = spread(crossing, covariance)
         reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
@@ -549,7 +549,7 @@ class Tracker:
                 return replace(past.tracked, registration=sure, begins=False)
         axes = self._axes(info)
         T, G = axes.pose(best.T_slice_model), axes.twist(best.T_slice_model)
-        C = G @ best.covariance @ G.T
+        C = carried(G, best.covariance)
         kind = self.options.prediction
         time_s, interval_s = info.time_s, 1.0
         if past is not None and prediction is not None:
@@ -593,7 +593,7 @@ class Tracker:
         if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
         G = motion.inverse_twist(to_still)
-        return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
+        return Velocity(twist=G @ state.velocity, covariance=carried(G, state.covariance[6:, 6:]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
