@@ -120,9 +120,9 @@ class Follower:
         self._age += 1
         if known is None or self._age > MAX_AGE or not _is_plain(slice_, self.options):
             return self._measured_in_full(slice_, rods, uv_px, radius_px)
-        if len(rods) == len(known.rods) and (rods == known.rods).all():
+        if rods.tolist() == known.rods.tolist():
             seen, found = self._follow(slice_, known, uv_px, radius_px)
-            if found.all():
+            if all(found.tolist()):
                 return seen
             rest = ~found
         else:
@@ -181,13 +181,13 @@ class Follower:
         good &= off <= radius
         good &= np.count_nonzero(_length(centre[:, None] - centre) <= RADIUS_PX, axis=1) == 1  # each is near itself
         beyond = off + radius > RADIUS_PX
-        if beyond.any():  # the windows do not show all that was to be looked at
+        if any(beyond.tolist()):  # the windows do not show all that was to be looked at
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
             good[beyond] &= windows.nothing_else(centre[beyond], uv[beyond], radius[beyond], level[beyond])
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
-        if self._law_age > LAW_EVERY or (good & looks.have_changed(known, fitted)).any():
+        if self._law_age > LAW_EVERY or any((good & looks.have_changed(known, fitted)).tolist()):
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
         structure = structure_near(fitted, known.law.rough, RADIUS_PX)
@@ -203,7 +203,7 @@ class Follower:
             angle_rad=region.angle,
         )
         known.seen(fitted, region)
-        if good.all():
+        if all(good.tolist()):
             self._known = known
             return spots, good
         if good.any():
@@ -340,7 +340,8 @@ class _Region(NamedTuple):
     def is_that_of(self, known: _Known) -> BoolArray:
         """Whether (k,) a spot is as long and thick as it was, and has not become long or round."""
         change, (long, thick) = self.axes / known.axes, known.axes
-        same = ((change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)).all(axis=0)
+        length_is, thickness_is = (change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)
+        same = length_is & thickness_is
         doubt = np.where(known.long.mask, 1.0 / LONG_DOUBT, LONG_DOUBT) * LONG_RATIO
         same &= (long > doubt * thick) == known.long.mask
         return np.asarray(same)
@@ -399,9 +400,8 @@ def _stepped(
     n_clipped = (clipped & region.own).sum(axis=1)
     long = known.long if len(known.long) else None
     along, across = known.coordinates
-    rows = Rows(
-        along, across, values, clipped if n_clipped.any() else None, root_weights, None if long is None else long.mask
-    )
+    cut_off = clipped if any(n_clipped.tolist()) else None
+    rows = Rows(along, across, values, cut_off, root_weights, None if long is None else long.mask)
     parameters = known.parameters.copy()
     parameters[CENTRE] = brightest if long is None else long.turned(brightest)
 
@@ -495,7 +495,7 @@ class _Windows(NamedTuple):
         weights = self._at(first, RADIUS_PX)
         weights -= known.level[:, None]
         np.maximum(weights, 0.0, out=weights)
-        sums = weights @ _coordinates()[2]
+        sums = weights.dot(_coordinates()[2])
         centre = first + sums[:, :2] / np.maximum(sums[:, 2:], 1e-9)
         middles = np.rint(centre)
         values, good = self._at(middles, RADIUS_PX), self._inside(middles, RADIUS_PX)

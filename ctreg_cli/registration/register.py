@@ -98,6 +98,7 @@ def make_scene(
 ) -> Scene:
     """Spots in millimetres with all that bears on the pose."""
     s = scale.mm_per_px
+    contrasts = spots.contrast.tolist()
     field = None
     if shape is not None:
         field = np.array([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]) * s
@@ -105,7 +106,7 @@ def make_scene(
         xy_mm=spots.uv_px * s,
         covariance_mm=spots.covariance_px * (s[:, None] * s),
         prior=pose_prior(model, T_patient_slice, options),
-        brightness=spots.contrast if len(spots) and np.isfinite(spots.contrast).all() else None,
+        brightness=spots.contrast if contrasts and all(map(math.isfinite, contrasts)) else None,
         half_slab_mm=0.5 * thickness_mm if thickness_mm is not None else 0.0,
         field_mm=field,
         resolved_mm=_resolved_mm(spots, model, scale),

@@ -27,7 +27,7 @@ def greatest_noise_mm(model: RodModel, scene: Scene) -> float:
 def spread(crossing: Crossing, covariance: FloatArray) -> FloatArray:
     """(n, 2, 2) covariance of crossings that a pose's ``covariance`` (6, 6) makes, mm²."""
     J = crossing.jacobian
-    JC = (J.reshape(-1, 6) @ covariance).reshape(J.shape)  # one product of all rods costs less than one each
+    JC = J.reshape(-1, 6).dot(covariance).reshape(J.shape)  # one product of all rods costs less than one each
     result: FloatArray = JC @ J.transpose(0, 2, 1)
     return result
 

@@ -122,9 +122,9 @@ def correct(
         kind: as for :func:`start`.
     """
     S_inverse = inverse_positive(predicted.pose_covariance + covariance)
-    gain = predicted.covariance[:, :6] @ S_inverse
-    step = gain @ innovation
-    P = predicted.covariance - gain @ predicted.covariance[:6]
+    gain = predicted.covariance[:, :6].dot(S_inverse)
+    step = gain.dot(innovation)
+    P = predicted.covariance - gain.dot(predicted.covariance[:6])
     intensity, information = _learn(predicted, S_inverse, innovation, dt_s, kind)
     return MotionState(
         T=updated(predicted.T, step[:6]),
@@ -140,7 +140,7 @@ def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
-    z, rows = (S_inverse @ innovation).tolist(), S_inverse.tolist()
+    z, rows = S_inverse.dot(innovation).tolist(), S_inverse.tolist()
     pair = []
     for i, (intensity, old) in enumerate(zip(predicted.intensity, predicted.information, strict=True)):
         j, k, l = range(3 * i, 3 * i + 3)  # translation, then rotation
@@ -171,27 +171,27 @@ class StillAxes:
     def pose(self, T_slice_model: FloatArray) -> FloatArray:
         """The pose there of a pose in the slice."""
         T = T_slice_model.copy()
-        T[:3, 3] += T[:3, :3] @ self.middle
-        return T if self.T_patient_slice is None else self.T_patient_slice @ T
+        T[:3, 3] += T[:3, :3].dot(self.middle)
+        return T if self.T_patient_slice is None else self.T_patient_slice.dot(T)
 
     def slice_pose(self, T: FloatArray) -> FloatArray:
         """``T_slice_model`` of a pose there."""
         placed = T.copy()
         if self.T_patient_slice is not None:
             placed[:3, 3] -= self.T_patient_slice[:3, 3]
-            placed[:3] = self.T_patient_slice[:3, :3].T @ placed[:3]
-        placed[:3, 3] -= placed[:3, :3] @ self.middle
+            placed[:3] = self.T_patient_slice[:3, :3].T.dot(placed[:3])
+        placed[:3, 3] -= placed[:3, :3].dot(self.middle)
         return placed
 
     def twist(self, T_slice_model: FloatArray) -> FloatArray:
         """(6, 6) that takes a twist at the model origin in slice axes to the one there."""
-        G = shifted(T_slice_model[:3, :3] @ self.middle)
-        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]) @ G
+        G = shifted(T_slice_model[:3, :3].dot(self.middle))
+        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]).dot(G)
 
     def slice_twist(self, T_slice_model: FloatArray) -> FloatArray:
         """The inverse of :meth:`twist`."""
-        G = shifted(-T_slice_model[:3, :3] @ self.middle)
-        return G if self.T_patient_slice is None else G @ _turned(self.T_patient_slice[:3, :3].T)
+        G = shifted(-T_slice_model[:3, :3].dot(self.middle))
+        return G if self.T_patient_slice is None else G.dot(_turned(self.T_patient_slice[:3, :3].T))
 
 
 def inverse_twist(G: FloatArray) -> FloatArray:
@@ -199,7 +199,7 @@ def inverse_twist(G: FloatArray) -> FloatArray:
     B = np.zeros((6, 6))
     R_inverse = G[3:, 3:].T
     B[:3, :3] = B[3:, 3:] = R_inverse
-    B[:3, 3:] = -R_inverse @ G[:3, 3:] @ R_inverse
+    B[:3, 3:] = -R_inverse.dot(G[:3, 3:]).dot(R_inverse)
     return B
 
 

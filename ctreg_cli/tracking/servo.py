@@ -106,7 +106,7 @@ class View(NamedTuple):
 
     def stepped(self, twist: FloatArray) -> View:
         """What is seen after a small twist (6,), to first order in spots and residuals."""
-        shift = (self.jacobian @ twist).reshape(-1, 2)
+        shift = self.jacobian.dot(twist).reshape(-1, 2)
         return View(
             spots_px=self.spots_px + shift,
             residual_px=self.residual_px - shift,
@@ -120,7 +120,7 @@ class View(NamedTuple):
     def chi2(self) -> float:
         """Σ rᵀ W r."""
         r = self.residual_px[:, :, None]
-        return float((self.weight @ r).ravel() @ r.ravel())
+        return float((self.weight @ r).ravel().dot(r.ravel()))
 
     @property
     def rms_px(self) -> float:
@@ -131,7 +131,7 @@ class View(NamedTuple):
     def sum_of_squares_px2(self) -> float:
         """Σ rᵀ r."""
         r = self.residual_px.ravel()
-        return float(r @ r)
+        return float(r.dot(r))
 
     def weighted(self, jacobian: FloatArray) -> FloatArray:
         """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
@@ -297,7 +297,7 @@ class _Law(NamedTuple):
     def of(cls, here: View, jacobian: FloatArray | None) -> _Law:
         J = here.jacobian if jacobian is None else jacobian
         WJ = here.weighted(J)
-        information = WJ.T @ J
+        information = WJ.T.dot(J)
         return cls(
             weighted=WJ,
             information=information,
@@ -306,9 +306,9 @@ class _Law(NamedTuple):
 
     def full_step(self, here: View) -> tuple[FloatArray, float]:
         """The twist (6,) of gain one, and how far it would move the spots: Σ ‖Δs‖² in sd, to first order."""
-        gradient = here.residual_px.reshape(-1) @ self.weighted
+        gradient = here.residual_px.reshape(-1).dot(self.weighted)
         step = solve_positive(self.information, gradient)
-        return step, float(gradient @ step)
+        return step, float(gradient.dot(step))
 
     def margin(self, here: View, size_mm: float) -> float:
         """:func:`stability_margin`; one where Ĵ is the Jacobian itself."""

@@ -106,7 +106,7 @@ def verified(
         return None
     crossings = outlook.crossing
     missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
-    if not outlook.may_be_seen()[rods].all() or len(missing) > len(rods):
+    if not all(outlook.may_be_seen()[rods].tolist()) or len(missing) > len(rods):
         return None
     apart2 = _least_distance2(crossings.xy_mm, rods, missing)
     if apart2 < _reach_mm(model) ** 2 or outlook.rod_end_shift_mm(rods) > 0:
@@ -133,7 +133,7 @@ def verified(
         residual_px=_kept(residual),
         lambda_mm=_kept(seen.crossing.lambda_mm),
         missing_rods=_kept(missing),
-        missing_px=_kept(crossings.xy_mm[missing] / scale.mm_per_px),
+        missing_px=_kept(crossings.xy_mm.take(missing, axis=0) / scale.mm_per_px),
         rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
@@ -273,7 +273,7 @@ class LeftOut(NamedTuple):
     def of(cls, moved: ServoResult) -> LeftOut | None:
         """None where a spot alone fixes a direction of the pose: the others do not predict it."""
         own, J = moved.view.covariance_px, moved.view.jacobian
-        influence = moved.covariance @ J.T
+        influence = moved.covariance.dot(J.T)
         k = len(own)
         slack = own - J.reshape(k, 2, 6) @ influence.reshape(6, k, 2).transpose(1, 0, 2)
         slack_det, own_det = determinant_2x2(slack), determinant_2x2(own)
@@ -296,16 +296,16 @@ class LeftOut(NamedTuple):
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
         """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
         k, p = len(self.left), len(points)
-        G = levers(points @ moved.T[:3, :3].T)
+        G = levers(points.dot(moved.T[:3, :3].T))
         # (p, k, 3, 2)
-        moves = (G.reshape(3 * p, 6) @ self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
+        moves = G.reshape(3 * p, 6).dot(self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
         variance = np.empty((p, k + 1, 3, 3))
         variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
         variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
         level = np.sqrt(np.linalg.eigvalsh(variance)[..., -1])
         level *= _sd_at_risk(risk, k)
-        separation = moves @ self.pull[:, :, None]
-        level[:, :k] += np.sqrt((separation * separation).sum(axis=(2, 3)))
+        separation = (moves @ self.pull[:, :, None])[..., 0]
+        level[:, :k] += np.sqrt((separation * separation).sum(axis=-1))
         return np.asarray(level.max(axis=1))
 
 
