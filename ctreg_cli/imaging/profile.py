@@ -84,8 +84,10 @@ class Rows:
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
         self._fill_background()
+        #: whether the last evaluation left pixels out, and so cleared them in the constant rows too
         self._has_left_out = False
-        #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
+        #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals;
+        #: filled anew by every evaluation
         self.by_spot = self._rows.transpose(1, 0, 2)
 
     @property
@@ -128,16 +130,16 @@ class Rows:
         eta += x
         q = xi * xi
         slope = xi  # half of ∂q/∂ξ
-        # powers of two cost less than those of e
+        # all powers and logarithms of pixels are to base 2: exp2 costs less than exp
         if self.long is not None:
             at = np.flatnonzero(self.long)
             square, gamma = q.take(at, axis=0), beta.take(at, axis=0)
             square += _TINY
             log2_along = np.log2(square)
             along = np.exp2(gamma * log2_along)
-            d_along = gamma * along
+            gamma_along = gamma * along
             slope, q[at], beta[at] = xi.copy(), along, LONG_BETA
-            slope[at] *= d_along / square
+            slope[at] *= gamma_along / square
         q += eta * eta
         q += _TINY
         log2_q = np.log2(q)
@@ -152,10 +154,10 @@ class Rows:
         np.multiply(steepness, log2_q, out=rows[FLATNESS])
         steepness /= q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
         if self.long is not None:
-            d_along *= log2_along
-            d_along *= 0.5 * _LN2
-            d_along *= steepness.take(at, axis=0)
-            rows[FLATNESS, at] = d_along
+            gamma_along *= log2_along
+            gamma_along *= 0.5 * _LN2
+            gamma_along *= steepness.take(at, axis=0)
+            rows[FLATNESS, at] = gamma_along
         d_xi = np.multiply(steepness, slope, out=rows[0])
         d_eta = np.multiply(steepness, eta, out=rows[1])
         np.multiply(d_xi, xi, out=rows[6])

@@ -62,6 +62,7 @@ _DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _INTEGER = re.compile(rb"[+-]?\d{1,12}")
 _UID = re.compile(r"[0-9.]{1,64}")
 _BINARY = {"US": "H", "SS": "h", "UL": "I", "SL": "i", "FL": "f", "FD": "d"}
+_INTEGER_BYTES = {code: struct.calcsize(code) for code in "HhIi"}
 _KNOWN_VR = {str(vr).encode() for vr in VR}
 
 
@@ -184,10 +185,10 @@ class Elements:
         return [Elements(_whole(item.elements()), self.little_endian) for item in value]
 
     def _one(self, keyword: str, value: bytes, code: str) -> int:
+        if len(value) == _INTEGER_BYTES[code]:  # nearly always
+            return int.from_bytes(value, "little" if self.little_endian else "big", signed=code.islower())
         numbers = self._unpack(keyword, value, code)
-        if len(numbers) != 1:
-            raise problem(keyword, f"holds {len(numbers)} values, not 1")
-        return int(numbers[0])
+        raise problem(keyword, f"holds {len(numbers)} values, not 1")
 
     def _unpack(self, keyword: str, value: bytes, code: str) -> tuple[Any, ...]:
         size = struct.calcsize(code)
