@@ -17,7 +17,8 @@ def frozen(values: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
         ValueError: another shape; the message quotes both.
     """
     array = np.array(values, dtype=np.float64)
-    if array.shape == shape and array.size:  # nearly always, and the tests below are slow
+    if array.size and (array.shape == shape or (shape[0] is None and array.shape[1:] == shape[1:])):
+        # nearly always, and the tests below are slow
         array.setflags(write=False)
         return array
     if array.size == 0 and 0 in (0 if n is None else n for n in shape):

@@ -235,7 +235,9 @@ def track_slice(
         prediction = None if override is None else tracker.predict(slice_.info, override)
         if override is not None and prediction is not None:
             rods = np.flatnonzero(prediction.visible & _inside(prediction.spots_px, slice_.info.shape))
-            spots = follower.measure(slice_, rods, prediction.spots_px[rods], prediction.radius_px[rods])
+            spots = follower.measure(
+                slice_, rods, prediction.spots_px.take(rods, axis=0), prediction.radius_px.take(rods)
+            )
             tracked = tracker.follow(spots, slice_.info, override)
             if tracked is not None:
                 item = SpotSlice(info=slice_.info, spots=spots)

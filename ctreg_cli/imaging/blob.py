@@ -232,7 +232,7 @@ def moments_of(own: BoolArray, monomials: FloatArray) -> tuple[FloatArray, Float
 
     ``monomials`` are those of the pixels, (p, 7) rows of :func:`monomials`.
     """
-    sums = own.astype(np.float64) @ monomials
+    sums = own.astype(np.float64).dot(monomials)
     area = sums[:, 0].copy()
     sums /= np.maximum(sums[:, :1], 1.0)
     centre = sums[:, 1:3].copy()

@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.imaging.blob import (
@@ -119,9 +120,9 @@ class Follower:
         self._age += 1
         if known is None or self._age > MAX_AGE or not _is_plain(slice_, self.options):
             return self._measured_in_full(slice_, rods, uv_px, radius_px)
-        if len(rods) == len(known.rods) and (rods == known.rods).all():
+        if rods.tolist() == known.rods.tolist():
             seen, found = self._follow(slice_, known, uv_px, radius_px)
-            if found.all():
+            if all(found.tolist()):
                 return seen
             rest = ~found
         else:
@@ -178,15 +179,15 @@ class Follower:
         centre = middles + fitted.centre.T
         off = _length(centre - uv)
         good &= off <= radius
-        good &= (_length(centre[:, None] - centre) <= RADIUS_PX).sum(axis=1) == 1  # each is near itself
+        good &= np.count_nonzero(_length(centre[:, None] - centre) <= RADIUS_PX, axis=1) == 1  # each is near itself
         beyond = off + radius > RADIUS_PX
-        if beyond.any():  # the windows do not show all that was to be looked at
+        if any(beyond.tolist()):  # the windows do not show all that was to be looked at
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
             good[beyond] &= windows.nothing_else(centre[beyond], uv[beyond], radius[beyond], level[beyond])
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
-        if self._law_age > LAW_EVERY or (good & looks.have_changed(known, fitted)).any():
+        if self._law_age > LAW_EVERY or any((good & looks.have_changed(known, fitted)).tolist()):
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
         structure = structure_near(fitted, known.law.rough, RADIUS_PX)
@@ -202,7 +203,7 @@ class Follower:
             angle_rad=region.angle,
         )
         known.seen(fitted, region)
-        if good.all():
+        if all(good.tolist()):
             self._known = known
             return spots, good
         if good.any():
@@ -318,8 +319,7 @@ _OF_EACH = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Region:
+class _Region(NamedTuple):
     """What of ``k`` windows lies above half height."""
 
     own: BoolArray
@@ -340,14 +340,14 @@ class _Region:
     def is_that_of(self, known: _Known) -> BoolArray:
         """Whether (k,) a spot is as long and thick as it was, and has not become long or round."""
         change, (long, thick) = self.axes / known.axes, known.axes
-        same = ((change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)).all(axis=0)
+        length_is, thickness_is = (change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)
+        same = length_is & thickness_is
         doubt = np.where(known.long.mask, 1.0 / LONG_DOUBT, LONG_DOUBT) * LONG_RATIO
         same &= (long > doubt * thick) == known.long.mask
         return np.asarray(same)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Looks:
+class _Looks(NamedTuple):
     """What fits left: mean squares (k,) of the weighted residuals, and the greatest residual (k,) beside each spot."""
 
     height: FloatArray
@@ -400,22 +400,18 @@ def _stepped(
     n_clipped = (clipped & region.own).sum(axis=1)
     long = known.long if len(known.long) else None
     along, across = known.coordinates
-    rows = Rows(
-        along, across, values, clipped if n_clipped.any() else None, root_weights, None if long is None else long.mask
-    )
+    cut_off = clipped if any(n_clipped.tolist()) else None
+    rows = Rows(along, across, values, cut_off, root_weights, None if long is None else long.mask)
     parameters = known.parameters.copy()
     parameters[CENTRE] = brightest if long is None else long.turned(brightest)
 
-    columns = np.zeros((len(values), N_PARAMETERS, 3))
-    columns[:, 0, 0] = columns[:, 1, 1] = 1.0
     for n_left in reversed(range(MAX_STEPS)):
         products = rows.evaluate(parameters)
         normal = products[:, :-1, :-1] + _PRIOR_MATRIX
         normal[:, FLATNESS, FLATNESS] += known.flatness_prior
-        columns[:, :, 2] = products[:, :-1, -1]
-        columns[:, FLATNESS, 2] -= known.flatness_prior * (parameters[FLATNESS] - known.flatness)
-        solved = np.asarray(np.linalg.solve(normal, columns), dtype=np.float64)
-        step = solved[:, :, 2].T
+        gradient = products[:, -1, :-1]
+        gradient[:, FLATNESS] -= known.flatness_prior * (parameters[FLATNESS] - known.flatness)
+        shift, step = _solved(normal, gradient)
         small = (np.abs(step) < _LAST_STEP).all(axis=0)
         parameters = moved(parameters, step)
         if not n_left or small.all():
@@ -438,17 +434,32 @@ def _stepped(
         n_clipped=n_clipped,
         ceiling=ceiling,
     )
-    return fitted, solved[:, :, :2], np.asarray(small)
+    return fitted, shift, np.asarray(small)
+
+
+def _solved(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The first two columns (k, 10, 2) of the inverses of normal matrices (k, 10, 10), and the steps (10, k).
+
+    By Cholesky one by one, which costs half of one call for all; NaN where a matrix is not positive definite.
+    """
+    solved = np.zeros((len(normal), 3, N_PARAMETERS))
+    solved[:, 0, 0] = solved[:, 1, 1] = 1.0
+    solved[:, 2] = gradient
+    for matrix, wanted in zip(normal, solved, strict=True):
+        # a symmetric matrix is its transpose, which is how LAPACK counts; the solution takes the place of what is asked
+        _, _, failed = dposv(matrix.T, wanted.T, overwrite_b=True)
+        if failed:
+            wanted.fill(np.nan)
+    return solved[:, :2].transpose(0, 2, 1), solved[:, 2].T
 
 
 def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:
     """(k,) of the centre along u and v together, were the weights all that is known of the noise."""
-    l0, _, l2 = parameters[SHAPE]
-    return np.asarray(shift[:, 0, 0] * np.exp(-2.0 * l0) + shift[:, 1, 1] * np.exp(-2.0 * l2))
+    along_u, _, along_v = np.exp(-2.0 * parameters[SHAPE])
+    return np.asarray(shift[:, 0, 0] * along_u + shift[:, 1, 1] * along_v)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Windows:
+class _Windows(NamedTuple):
     """The pixels of a slice, spots upright; only integers, so that each is a value."""
 
     #: the image in one line
@@ -484,7 +495,7 @@ class _Windows:
         weights = self._at(first, RADIUS_PX)
         weights -= known.level[:, None]
         np.maximum(weights, 0.0, out=weights)
-        sums = weights @ _coordinates()[2]
+        sums = weights.dot(_coordinates()[2])
         centre = first + sums[:, :2] / np.maximum(sums[:, 2:], 1e-9)
         middles = np.rint(centre)
         values, good = self._at(middles, RADIUS_PX), self._inside(middles, RADIUS_PX)
@@ -518,8 +529,8 @@ class _Windows:
         """Upright values (k, p) on discs about whole pixels (k, 2); beyond the image they mean nothing."""
         columns = self.shape[1]
         at = (middles[:, 1] * columns + middles[:, 0]).astype(np.intp)
-        values: FloatArray = self.stored.take(at[:, None] + _offsets(radius, columns), mode="clip") * self.sign
-        return values
+        values: FloatArray = self.stored.take(at[:, None] + _offsets(radius, columns), mode="clip").astype(np.float64)
+        return values if self.sign > 0 else -values
 
     def _may_be_padding(self, values: FloatArray) -> bool:
         return self.padding is not None and self.padding[1] >= values.min() and self.padding[0] <= values.max()

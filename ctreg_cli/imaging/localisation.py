@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,8 +78,7 @@ class Centres:
     noise: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Profiles:
+class Profiles(NamedTuple):
     """Profiles fitted to ``k`` blobs; ``p`` pixels in the disc of each window."""
 
     #: (10, k); long spots are seen along their own axes

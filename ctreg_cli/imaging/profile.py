@@ -42,7 +42,7 @@ def moved(parameters: FloatArray, step: FloatArray) -> FloatArray:
     others are added.
     """
     after: FloatArray = parameters + step
-    scale_u, scale_v, l1 = np.exp(parameters[6]), np.exp(parameters[8]), parameters[7]
+    (scale_u, _, scale_v), l1 = np.exp(parameters[SHAPE]), parameters[7]
     du = -step[0] / scale_u
     after[0] = parameters[0] + du
     after[1] = parameters[1] - (step[1] + l1 * du) / scale_v
@@ -81,13 +81,27 @@ class Rows:
         """
         self._u, self._v, self._values, self._clipped, self.root_weights = u, v, values, clipped, root_weights
         self.long = long
-        #: (k,) whether pixels of a spot are clipped
-        self.cut_off = np.zeros(len(values), dtype=bool) if clipped is None else clipped.any(axis=1)
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
-        self._rows[3], self._rows[4], self._rows[5] = root_weights, root_weights * u, root_weights * v
-        #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals
+        self._fill_background()
+        #: whether the last evaluation left pixels out, and so cleared them in the constant rows too
+        self._has_left_out = False
+        #: (k, 11, p): derivatives with respect to the ten steps of :func:`moved`, and in the last row the residuals;
+        #: filled anew by every evaluation
         self.by_spot = self._rows.transpose(1, 0, 2)
+
+    @property
+    def cut_off(self) -> BoolArray:
+        """(k,) whether pixels of a spot are clipped."""
+        if self._clipped is None:
+            return np.zeros(len(self._values), dtype=bool)
+        return np.asarray(self._clipped.any(axis=1))
+
+    def _fill_background(self) -> None:
+        """The derivatives with respect to the background and its gradient, which no parameter changes."""
+        self._rows[BACKGROUND] = self.root_weights
+        np.multiply(self.root_weights, self._u, out=self._rows[4])
+        np.multiply(self.root_weights, self._v, out=self._rows[5])
 
     def take(self, which: IntArray) -> Rows:
         """Some of the spots."""
@@ -104,33 +118,46 @@ class Rows:
         pixel says only "at least this bright": where the profile is brighter still, it takes no part.
         """
         rows = self._rows
-        centre_u, centre_v, log_height, background, g_u, g_v, l0, l1, l2, flatness = parameters[:, :, None]
+        if self._has_left_out:
+            self._fill_background()
+        centre_u, centre_v, log_height, background, g_u, g_v, _, l1, _, _ = parameters[:, :, None]
+        scale_u, _, scale_v, beta = np.exp(parameters[SHAPE.start :, :, None])
         x = self._u - centre_u
-        xi = np.exp(l0) * x
-        eta = np.exp(l2) * (self._v - centre_v)
-        eta += l1 * x
+        xi = scale_u * x
+        eta = self._v - centre_v
+        eta *= scale_v
+        x *= l1
+        eta += x
         q = xi * xi
-        beta = np.exp(flatness)
         slope = xi  # half of ∂q/∂ξ
+        # all powers and logarithms of pixels are to base 2: exp2 costs less than exp
         if self.long is not None:
             at = np.flatnonzero(self.long)
-            square, gamma = q[at] + _TINY, beta[at]
-            log_along = np.log(square)
-            along = np.exp(gamma * log_along)
+            square, gamma = q.take(at, axis=0), beta.take(at, axis=0)
+            square += _TINY
+            log2_along = np.log2(square)
+            along = np.exp2(gamma * log2_along)
+            gamma_along = gamma * along
             slope, q[at], beta[at] = xi.copy(), along, LONG_BETA
-            slope[at] *= gamma * along / square
+            slope[at] *= gamma_along / square
         q += eta * eta
         q += _TINY
-        log_q = np.log(q)
-        steepness = np.exp(beta * log_q)
-        spot = np.exp(log_height - _LN2 * steepness, out=rows[LOG_HEIGHT])
+        log2_q = np.log2(q)
+        steepness = beta * log2_q
+        np.exp2(steepness, out=steepness)
+        spot = np.subtract(log_height / _LN2, steepness, out=rows[LOG_HEIGHT])
+        np.exp2(spot, out=spot)
         spot *= self.root_weights
         steepness *= spot
         steepness *= -2.0 * _LN2 * beta
-        np.multiply(0.5 * steepness, log_q, out=rows[FLATNESS])
+        log2_q *= 0.5 * _LN2
+        np.multiply(steepness, log2_q, out=rows[FLATNESS])
         steepness /= q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
         if self.long is not None:
-            rows[FLATNESS, at] = 0.5 * steepness[at] * gamma * along * log_along
+            gamma_along *= log2_along
+            gamma_along *= 0.5 * _LN2
+            gamma_along *= steepness.take(at, axis=0)
+            rows[FLATNESS, at] = gamma_along
         d_xi = np.multiply(steepness, slope, out=rows[0])
         d_eta = np.multiply(steepness, eta, out=rows[1])
         np.multiply(d_xi, xi, out=rows[6])
@@ -140,8 +167,8 @@ class Rows:
         residuals -= background * rows[BACKGROUND]
         residuals -= g_u * rows[4]
         residuals -= g_v * rows[5]
-        self.by_spot = rows.transpose(1, 0, 2)
         if self._clipped is not None:
-            satisfied = self._clipped & (residuals <= 0)
-            self.by_spot = np.where(satisfied[:, None], 0.0, self.by_spot)
+            satisfied = np.flatnonzero(self._clipped & (residuals <= 0))
+            rows.reshape(len(rows), -1)[:, satisfied] = 0.0
+            self._has_left_out = len(satisfied) > 0
         return np.asarray(self.by_spot @ rows.transpose(1, 2, 0))

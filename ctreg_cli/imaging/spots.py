@@ -50,10 +50,11 @@ class Spots:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "uv_px", frozen(self.uv_px, (None, 2)))
-        m = len(self.uv_px)
+        uv = frozen(self.uv_px, (None, 2))
+        m = len(uv)
+        set_(self, "uv_px", uv)
         set_(self, "covariance_px", frozen(self.covariance_px, (m, 2, 2)))
-        for name in ("area_px", "contrast", "major_px", "minor_px", "angle_rad"):
+        for name in _ARRAYS[2:]:
             values = getattr(self, name)
             set_(self, name, frozen(values if len(values) else np.full(m, np.nan), (m,)))
 

@@ -156,7 +156,7 @@ def odd_variance(
     paired = odd == odd  # neither is NaN
     pairs = np.maximum(0.5 * paired.sum(axis=1), 1.0)
     odd *= odd
-    variance = 0.25 * np.where(paired, odd, 0.0).sum(axis=1) / pairs
+    variance = 0.25 * np.fmax(odd, 0.0).sum(axis=1) / pairs  # fmax passes NaN over
     excess = variance / noise**2 - 1.0
     chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
     return np.asarray(noise**2 * excess * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))

@@ -11,7 +11,6 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from sys import intern
-from typing import BinaryIO
 
 from pydicom.uid import UID
 
@@ -24,6 +23,7 @@ from ctreg_cli.io.dicom_header import (
     HeaderProblem,
     looks_like_dicom,
     open_binary,
+    plain_header,
     problem,
     read_header,
     tag_name,
@@ -64,12 +64,14 @@ def is_dicom(path: Path, head: bytes) -> bool:
     return looks_like_dicom(head) or path.suffix.lower() in DICOM_SUFFIXES
 
 
-def read_dicom(path: Path, source: str) -> list[ImageRecord] | NotAnImage:
+def read_dicom(path: Path, source: str, head: bytes = b"") -> list[ImageRecord] | NotAnImage:
     """Read the header of one file; pixels are read later, by :meth:`ImageRecord.load`.
 
     Args:
         path: the file.
         source: its name in results; ``#1``, ``#2``, ... is added in a multi-frame file.
+        head: its first :data:`~ctreg_cli.io.dicom_plain.HEAD_BYTES`, where they have been read already: of a plain
+            file no more is needed.
 
     Returns:
         A record a frame, in the file's order. A file that cannot be used is one record with a ``problem``.
@@ -78,8 +80,7 @@ def read_dicom(path: Path, source: str) -> list[ImageRecord] | NotAnImage:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what pydicom finds odd is either checked here or harmless
         try:
-            with open_binary(path) as file:
-                return _read(path, source, file)
+            return _read(path, source, head)
         except HeaderProblem as error:
             return [ImageRecord(info=info, series=_LOST, problem=str(error))]
         except RecursionError:
@@ -90,11 +91,14 @@ def read_dicom(path: Path, source: str) -> list[ImageRecord] | NotAnImage:
             return [ImageRecord(info=info, series=_LOST, problem="its header is damaged")]
 
 
-def _read(path: Path, source: str, file: BinaryIO) -> list[ImageRecord] | NotAnImage:
+def _read(path: Path, source: str, head: bytes) -> list[ImageRecord] | NotAnImage:
     size = path.stat().st_size
     if size == 0:
         raise HeaderProblem("the file is empty")
-    header = read_header(file, size)
+    header = plain_header(head, size)
+    if header is None:
+        with open_binary(path) as file:
+            header = read_header(file, size)
     if _is_not_an_image(header):
         return NotAnImage()
     series = _series_key(path, header.elements)

@@ -61,10 +61,10 @@ def read_patient_from_slice(position: Elements, orientation: Elements) -> FloatA
         raise problem("ImageOrientationPatient", "is not two orthogonal unit vectors")
     if origin is None:
         return None
-    T = np.eye(4)
-    T[:3, :3] = axes
-    T[:3, 3] = origin
-    return frozen(T, (4, 4))
+    T = np.zeros((4, 4))
+    T[:3, :3], T[:3, 3], T[3, 3] = axes, origin, 1.0
+    T.flags.writeable = False
+    return T
 
 
 @lru_cache(maxsize=64)

@@ -25,7 +25,7 @@ from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian
 from pydicom.valuerep import VR
 from pydicom.values import convert_SQ
 
-from ctreg_cli.io.dicom_plain import HEAD_BYTES, PlainHeader, read_plain
+from ctreg_cli.io.dicom_plain import HEAD_BYTES, read_plain
 
 #: what is read of a header, top level; all else is stepped over
 _TOP_LEVEL = (
@@ -62,6 +62,7 @@ _DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _INTEGER = re.compile(rb"[+-]?\d{1,12}")
 _UID = re.compile(r"[0-9.]{1,64}")
 _BINARY = {"US": "H", "SS": "h", "UL": "I", "SL": "i", "FL": "f", "FD": "d"}
+_INTEGER_BYTES = {code: struct.calcsize(code) for code in "HhIi"}
 _KNOWN_VR = {str(vr).encode() for vr in VR}
 
 
@@ -184,10 +185,10 @@ class Elements:
         return [Elements(_whole(item.elements()), self.little_endian) for item in value]
 
     def _one(self, keyword: str, value: bytes, code: str) -> int:
+        if len(value) == _INTEGER_BYTES[code]:  # nearly always
+            return int.from_bytes(value, "little" if self.little_endian else "big", signed=code.islower())
         numbers = self._unpack(keyword, value, code)
-        if len(numbers) != 1:
-            raise problem(keyword, f"holds {len(numbers)} values, not 1")
-        return int(numbers[0])
+        raise problem(keyword, f"holds {len(numbers)} values, not 1")
 
     def _unpack(self, keyword: str, value: bytes, code: str) -> tuple[Any, ...]:
         size = struct.calcsize(code)
@@ -263,9 +264,9 @@ def read_header(file: BinaryIO, size: int) -> Header:
     """
     notes: list[str] = []
     head = file.read(HEAD_BYTES)
-    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    plain = plain_header(head, size)
     if plain is not None:
-        return _as_header(plain, size)
+        return plain
     head = head[: PREAMBLE_BYTES + 4]
     file.seek(len(head))
     if head[PREAMBLE_BYTES:] != MAGIC:
@@ -308,7 +309,11 @@ def read_header(file: BinaryIO, size: int) -> Header:
     )
 
 
-def _as_header(plain: PlainHeader, size: int) -> Header:
+def plain_header(head: bytes, size: int) -> Header | None:
+    """The header of a file of ``size`` bytes from its first :data:`HEAD_BYTES`; None where it is not plain."""
+    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    if plain is None:
+        return None
     return Header(
         elements=Elements(plain.elements, True),
         meta=Elements(plain.meta, True),

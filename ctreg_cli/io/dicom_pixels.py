@@ -185,11 +185,14 @@ class NativePixels:
         return _finished(stored, layout)
 
     def _read(self, dtype: np.dtype[Any], count: int, offset: int) -> NDArray[Any]:
+        stored = np.empty(count, dtype=dtype)
         try:
-            stored = np.fromfile(self.path, dtype=dtype, count=count, offset=offset)
+            with Path(self.path).open("rb") as file:
+                file.seek(offset)
+                n_bytes = file.readinto(stored.data)
         except OSError as error:
             raise UnreadableSliceError(f"the file cannot be read ({error.strerror})") from None
-        if stored.size != count:
+        if n_bytes != stored.nbytes:
             raise UnreadableSliceError(f"{tag_name('PixelData')} is cut short")
         return stored
 

@@ -9,7 +9,7 @@ element by element, which the tests hold.
 from __future__ import annotations
 
 import struct
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from typing import NamedTuple
 
 from pydicom.dataelem import RawDataElement
@@ -63,39 +63,60 @@ def read_plain(head: bytes, wanted: Container[int], pixel_tags: Container[int]) 
 
 
 def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> PlainHeader | None:
-    at, implicit, syntax = _PREAMBLE + 4, False, None
-    meta: dict[int, RawDataElement] = {}
-    elements: dict[int, RawDataElement] = {}
     make = RawDataElement._make
-    while True:
-        group, element, code, length = _explicit(head, at)
-        if syntax is None and group != _META_GROUP:  # the data set begins
-            named = meta.get(_TRANSFER_SYNTAX)
-            syntax = named and _SYNTAXES.get((named.value or b"").strip(b" \0"))
-            if syntax is None:
-                return None
-            implicit = syntax == ImplicitVRLittleEndian
-            if implicit == (code in _SHORT or code in _LONG) or (implicit and code.isalpha() and code.isupper()):
-                return None  # the first element contradicts the meta
-        at += 8
-        vr = None
-        if implicit:
-            (length,) = _long_length(head, at - 4)
-        elif (vr := _SHORT.get(code)) is None:
-            if (vr := _LONG.get(code)) is None:
-                return None
-            (length,) = _long_length(head, at)
-            at += 4
-        tag = group << 16 | element
-        if length == _UNDEFINED or group == _DELIMITERS:
+    meta: dict[int, RawDataElement] = {}
+    begin = _PREAMBLE + len(_MAGIC)
+    for tag, vr, length, at in _elements(head, begin, implicit=False):
+        if tag >> 16 != _META_GROUP:
+            break
+        begin = at + length
+        value = head[at:begin]
+        if len(value) < length:
             return None
-        if syntax is not None and tag in pixel_tags:
+        meta[tag] = make((tag, vr, length, value, at, False, True, True, False))
+    named = meta.get(_TRANSFER_SYNTAX)
+    syntax = named and _SYNTAXES.get((named.value or b"").strip(b" \0"))
+    group, _, code, _ = _explicit(head, begin)
+    if not syntax or group == _META_GROUP:
+        return None
+    implicit = syntax == ImplicitVRLittleEndian
+    if implicit == (code in _SHORT or code in _LONG) or (implicit and code.isalpha() and code.isupper()):
+        return None  # the first element contradicts the meta
+    elements: dict[int, RawDataElement] = {}
+    for tag, vr, length, at in _elements(head, begin, implicit=implicit):
+        if tag in pixel_tags:
             return PlainHeader(meta, elements, syntax, tag, vr, length, at)
-        after = at + length
-        if syntax is None or tag in wanted or tag == _CHARACTER_SET:
-            value = head[at:after]
+        if tag in wanted or tag == _CHARACTER_SET:
+            value = head[at : at + length]
             if len(value) < length or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
                 return None
-            kept = elements if syntax is not None else meta
-            kept[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
-        at = after
+            elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
+    return None
+
+
+def _elements(head: bytes, at: int, *, implicit: bool) -> Iterator[tuple[int, str | None, int, int]]:
+    """Tag, VR, length, and place of the value, of element after element; ends at one that is not plain.
+
+    Raises:
+        struct.error: the head ends.
+    """
+    short, long, explicit_element, implicit_element = _SHORT.get, _LONG.get, _explicit, _implicit
+    while True:
+        vr = None
+        if implicit:
+            group, element, length = implicit_element(head, at)
+            at += 8
+        else:
+            group, element, code, length = explicit_element(head, at)
+            at += 8
+            vr = short(code)
+            if vr is None:
+                vr = long(code)
+                if vr is None:
+                    return
+                (length,) = _long_length(head, at)
+                at += 4
+        if length == _UNDEFINED or group == _DELIMITERS:
+            return
+        yield group << 16 | element, vr, length, at
+        at += length

@@ -28,7 +28,6 @@ from ctreg_cli.io.image_record import ImageRecord, Kind, SeriesKey
 from ctreg_cli.io.image_series import Series, SeriesInfo, order, remarks_on
 from ctreg_cli.io.png import is_png, read_png
 
-_HEAD_BYTES = 256
 _MAX_SERIES_NAMED = 20
 
 NOT_AN_IMAGE = "not an image"
@@ -183,12 +182,13 @@ def _find(paths: Sequence[Path]) -> _Found:
 def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
     """The records of one file, or why it is skipped."""
     from ctreg_cli.io.dicom import NotAnImage, is_dicom, read_dicom
+    from ctreg_cli.io.dicom_plain import HEAD_BYTES
 
     if not path.is_file():  # a pipe or a device would be waited for
         return NOT_A_FILE
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+        with path.open("rb", buffering=0) as file:
+            head = file.read(HEAD_BYTES)
     except OSError as error:
         info = SliceInfo(source=source)
         unknown = SeriesKey(None, Kind.SLICE, "")
@@ -197,7 +197,7 @@ def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
         return [read_png(path, source)]
     if not is_dicom(path, head):
         return NOT_AN_IMAGE
-    records = read_dicom(path, source)
+    records = read_dicom(path, source, head)
     return NO_PIXELS if isinstance(records, NotAnImage) else records
 
 

@@ -15,7 +15,7 @@ from ctreg_cli._version import __version__
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import InputError
 from ctreg_cli.geometry.pose import from_quaternion
-from ctreg_cli.io.sinks import Encoding, cell, open_sinks, rounded
+from ctreg_cli.io.sinks import Encoding, open_sinks, rounded
 from ctreg_cli.io.tum import HEADER, tum_lines
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
@@ -84,8 +84,8 @@ def results_encoding(header: ResultsHeader, *, with_uids: bool = False) -> Encod
     """How a :class:`FrameResult` becomes a row of the pose table and a record of the pose document."""
 
     def row(result: FrameResult) -> list[Sequence[object]]:
-        fields = _fields(result, header)
-        return [[_cell(fields.get(name), digits) for name, digits in COLUMNS.items()]]
+        value_of = _fields(result, header).get
+        return [[_shortened(value_of(name), format_) for name, format_ in _CELL_FORMATS]]
 
     def record(result: FrameResult) -> dict[str, object]:
         fields = {name: _rounded(value, COLUMNS[name]) for name, value in _fields(result, header).items()}
@@ -171,13 +171,16 @@ def _rounded(value: object, digits: int | None) -> object:
     return rounded(value, digits)
 
 
-def _cell(value: object, digits: int | None) -> str:
-    """Text of :func:`_rounded`, formatted once where that gives the same."""
-    if digits is not None and isinstance(value, float) and math.isfinite(value):
-        text = f"{value:.{digits}g}"
-        if "e+" not in text:  # %g writes large numbers as powers of ten
-            return text
-    return cell(_rounded(value, digits))
+#: columns of the pose table, and how a number is written in them: in its significant digits, or (None) as it is
+_CELL_FORMATS = [(name, None if digits is None else f".{digits}g") for name, digits in COLUMNS.items()]
+
+
+def _shortened(value: object, format_: str | None) -> object:
+    """What a cell of the pose table shows: of a number, the text of :func:`_rounded`, formatted once."""
+    if format_ is None or not isinstance(value, float) or not math.isfinite(value):
+        return value
+    text = format(value, format_)
+    return text if "e+" not in text else float(text)  # %g writes large numbers as powers of ten
 
 
 def _pose_fields(candidate: Candidate) -> dict[str, object]:
@@ -188,10 +191,19 @@ def _pose_fields(candidate: Candidate) -> dict[str, object]:
     return {
         "n_matched": len(candidate.rod_index),
         "rms_px": float(candidate.rms_px),
-        **{"tx_mm": tx, "ty_mm": ty, "tz_mm": tz},
-        **{"qx": qx, "qy": qy, "qz": qz, "qw": qw},
-        **{"sd_tx_mm": sd_tx, "sd_ty_mm": sd_ty, "sd_tz_mm": sd_tz},
-        **{"sd_rx_deg": math.degrees(sd_rx), "sd_ry_deg": math.degrees(sd_ry), "sd_rz_deg": math.degrees(sd_rz)},
+        "tx_mm": tx,
+        "ty_mm": ty,
+        "tz_mm": tz,
+        "qx": qx,
+        "qy": qy,
+        "qz": qz,
+        "qw": qw,
+        "sd_tx_mm": sd_tx,
+        "sd_ty_mm": sd_ty,
+        "sd_tz_mm": sd_tz,
+        "sd_rx_deg": math.degrees(sd_rx),
+        "sd_ry_deg": math.degrees(sd_ry),
+        "sd_rz_deg": math.degrees(sd_rz),
         "iterations": int(candidate.iterations),
         "log_odds": float(candidate.log_odds),
         "inflation": float(candidate.inflation),
@@ -202,10 +214,18 @@ def _velocity_fields(velocity: Velocity) -> dict[str, object]:
     vx, vy, vz, wx, wy, wz = velocity.twist.tolist()
     sd_vx, sd_vy, sd_vz, sd_wx, sd_wy, sd_wz = map(math.sqrt, velocity.covariance.diagonal().tolist())
     return {
-        **{"vx_mm_s": vx, "vy_mm_s": vy, "vz_mm_s": vz},
-        **{"wx_deg_s": math.degrees(wx), "wy_deg_s": math.degrees(wy), "wz_deg_s": math.degrees(wz)},
-        **{"sd_vx_mm_s": sd_vx, "sd_vy_mm_s": sd_vy, "sd_vz_mm_s": sd_vz},
-        **{"sd_wx_deg_s": math.degrees(sd_wx), "sd_wy_deg_s": math.degrees(sd_wy), "sd_wz_deg_s": math.degrees(sd_wz)},
+        "vx_mm_s": vx,
+        "vy_mm_s": vy,
+        "vz_mm_s": vz,
+        "wx_deg_s": math.degrees(wx),
+        "wy_deg_s": math.degrees(wy),
+        "wz_deg_s": math.degrees(wz),
+        "sd_vx_mm_s": sd_vx,
+        "sd_vy_mm_s": sd_vy,
+        "sd_vz_mm_s": sd_vz,
+        "sd_wx_deg_s": math.degrees(sd_wx),
+        "sd_wy_deg_s": math.degrees(sd_wy),
+        "sd_wz_deg_s": math.degrees(sd_wz),
     }
 
 

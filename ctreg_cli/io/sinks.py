@@ -82,6 +82,8 @@ def rounded(value: float, digits: int) -> float:
 
 def cell(value: object) -> str:
     """Text of a CSV cell: shortest form that reads back the same, empty for None and NaN."""
+    if isinstance(value, str):
+        return value
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     if isinstance(value, float):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
+from statistics import median
 
 import numpy as np
 from scipy.special import chdtrc
@@ -97,6 +98,7 @@ def make_scene(
 ) -> Scene:
     """Spots in millimetres with all that bears on the pose."""
     s = scale.mm_per_px
+    contrasts = spots.contrast.tolist()
     field = None
     if shape is not None:
         field = np.array([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]) * s
@@ -104,7 +106,7 @@ def make_scene(
         xy_mm=spots.uv_px * s,
         covariance_mm=spots.covariance_px * (s[:, None] * s),
         prior=pose_prior(model, T_patient_slice, options),
-        brightness=spots.contrast if len(spots) and np.isfinite(spots.contrast).all() else None,
+        brightness=spots.contrast if contrasts and all(map(math.isfinite, contrasts)) else None,
         half_slab_mm=0.5 * thickness_mm if thickness_mm is not None else 0.0,
         field_mm=field,
         resolved_mm=_resolved_mm(spots, model, scale),
@@ -113,8 +115,9 @@ def make_scene(
 
 def _resolved_mm(spots: Spots, model: RodModel, scale: Scale) -> float:
     """Twice the width of a spot, as it is seen, or else as the rods are drawn, or a small part of the frame."""
-    if len(spots) and np.isfinite(spots.minor_px).all():
-        return 2 * float(np.median(spots.minor_px) * scale.mm_per_px.mean())
+    widths_px = spots.minor_px.tolist()
+    if widths_px and all(map(math.isfinite, widths_px)):
+        return float(median(widths_px)) * (scale.s_x + scale.s_y)
     diameters = [rod.diameter_mm for rod in model.rods if rod.diameter_mm]
     return 2 * max(diameters) if diameters else _UNRESOLVED * model.size_mm
 

@@ -27,30 +27,33 @@ def greatest_noise_mm(model: RodModel, scene: Scene) -> float:
 def spread(crossing: Crossing, covariance: FloatArray) -> FloatArray:
     """(n, 2, 2) covariance of crossings that a pose's ``covariance`` (6, 6) makes, mm²."""
     J = crossing.jacobian
-    result: FloatArray = J @ covariance @ J.transpose(0, 2, 1)
+    JC = J.reshape(-1, 6).dot(covariance).reshape(J.shape)  # one product of all rods costs less than one each
+    result: FloatArray = JC @ J.transpose(0, 2, 1)
     return result
 
 
 class Outlook:
     """What a pose expects of a slice."""
 
-    def __init__(self, model: RodModel, scene: Scene, T: FloatArray, crossing: Crossing | None = None) -> None:
-        """``crossing``: of all rods with ``T``, where it has been worked out already."""
+    def __init__(
+        self,
+        model: RodModel,
+        scene: Scene,
+        T: FloatArray,
+        crossing: Crossing | None = None,
+        noise_mm: float | None = None,
+    ) -> None:
+        """``crossing``, of all rods with ``T``, and :func:`greatest_noise_mm`, where they are worked out already."""
         self.model, self.scene, self.T = model, scene, T
         self.crossing = crossing or cross(T, model_lines(model))
-        self._mm_per_height = self.crossing.mm_per_height()
+        self.noise_mm = greatest_noise_mm(model, scene) if noise_mm is None else noise_mm
         along = self.crossing.lambda_mm
         #: (n,) along each rod from the crossing to the nearer end; negative beyond it
         self._to_end_mm = np.minimum(along, model.lengths - along)
-        self._slack_mm = self._end_slack_mm()
+        #: (n,) along each rod
+        self._slack_mm = self.crossing.mm_per_height * (scene.half_slab_mm + _END_SD * self.noise_mm)
+        self._slack_mm += _END_SIZES * model.size_mm
         self._in_field = self._inside_image()
-
-    def _end_slack_mm(self) -> FloatArray:
-        """(n,) along each rod."""
-        half_slab_mm, noise_mm = self.scene.half_slab_mm, greatest_noise_mm(self.model, self.scene)
-        slack: FloatArray = self._mm_per_height * (half_slab_mm + _END_SD * noise_mm)
-        slack += _END_SIZES * self.model.size_mm
-        return slack
 
     def _inside_image(self) -> BoolArray | None:
         """(n,) crossings inside the image; None where all are."""
@@ -58,11 +61,10 @@ class Outlook:
         if field is None:
             return None
         (left, top), (right, bottom) = field.tolist()
-        xy = self.crossing.xy_mm
-        (x_least, y_least), (x_most, y_most) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
-        if x_least >= left and x_most <= right and y_least >= top and y_most <= bottom:
+        x, y = self.crossing.xy_mm.T
+        xs, ys = x.tolist(), y.tolist()  # a rod that lies in the slice (NaN) may count as inside: it is not cut
+        if left <= min(xs) and max(xs) <= right and top <= min(ys) and max(ys) <= bottom:
             return None
-        x, y = xy.T
         return np.asarray((x >= left) & (x <= right) & (y >= top) & (y <= bottom))
 
     def may_be_seen(self) -> BoolArray:
@@ -81,7 +83,7 @@ class Outlook:
         half_slab_mm = self.scene.half_slab_mm
         if half_slab_mm == 0:
             return 0.0
-        return max(0.0, half_slab_mm - float((self._to_end_mm / self._mm_per_height)[rods].min()))
+        return max(0.0, half_slab_mm - float((self._to_end_mm / self.crossing.mm_per_height)[rods].min()))
 
     def assigned(self, covariance: FloatArray, spread_mm2: FloatArray | None = None) -> IntArray:
         """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6).
@@ -94,15 +96,15 @@ class Outlook:
         if greatest_tolerance_mm(self.model) > 0:
             k = self.crossing.slope
             G = G + (self.model.tolerances**2)[:, None, None] * (np.eye(2) + k[:, :, None] * k[:, None, :])
-        a, b, c = (G[:, i, j, None] + S[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-        d = xy.T[:, None] - self.crossing.xy_mm.T[:, :, None]  # (2, n, m)
-        d_x, d_y = d
+        a, b, _, c = G.reshape(-1, 4).T[:, :, None] + S.reshape(-1, 4).T[:, None]  # each (n, m)
+        d_x, d_y = xy.T[:, None] - self.crossing.xy_mm.T[:, :, None]
         distance2 = (c * d_x - (b + b) * d_y) * d_x + a * d_y * d_y
         inside = distance2 < GATE_SD**2 * (a * c - b * b)
         inside &= self.may_be_seen()[:, None]
         rods, spots = np.nonzero(inside)
         if len(set(rods.tolist())) < len(rods) or len(set(spots.tolist())) < len(spots):  # contested
             return np.asarray(nearest_assignment(self.model, self.scene, self.T[None], covariance)[0])
-        spot_of_rod = np.full(len(inside), -1, dtype=np.intp)
+        spot_of_rod = np.empty(len(inside), dtype=np.intp)
+        spot_of_rod.fill(-1)
         spot_of_rod[rods] = spots
         return spot_of_rod

@@ -44,9 +44,9 @@ class MotionState:
     velocity: FloatArray
     #: (12, 12) of pose and velocity
     covariance: FloatArray
-    #: (2,) intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
-    intensity: FloatArray
-    information: FloatArray
+    #: intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
+    intensity: tuple[float, float]
+    information: tuple[float, float]
     #: time that the motion has been watched for
     elapsed_s: float = 0.0
 
@@ -56,43 +56,49 @@ class MotionState:
         return self.covariance[:6, :6]
 
 
-def start(T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: FloatArray | None = None) -> MotionState:
+def start(
+    T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: tuple[float, float] = FIRST_INTENSITY
+) -> MotionState:
     """The motion of a frame seen once.
 
     Args:
         T: (4, 4) its pose, origin in the middle.
         covariance: (6, 6) of it.
         kind: ``velocity``, or ``identity``: the frame stays where it is but for chance.
-        intensity: (2,) what was learnt of the motion before.
+        intensity: what was learnt of the motion before.
     """
     full = np.zeros((12, 12))
     full[:6, :6] = covariance
     if kind == "velocity":
-        full.ravel()[_VELOCITY] = np.square(_each_axis(FIRST_VELOCITY_SD))
+        full.ravel()[_VELOCITY] = np.square(_each_axis(*FIRST_VELOCITY_SD))
     return MotionState(
         T=T,
         velocity=np.zeros(6),
         covariance=full,
-        intensity=np.array(FIRST_INTENSITY) if intensity is None else intensity,
-        information=np.zeros(2),
+        intensity=intensity,
+        information=(0.0, 0.0),
     )
 
 
 def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
     P = state.covariance.copy()
-    spread = (state.intensity * dt_s).tolist()
+    diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
+    place, turn = dt_s * state.intensity[0], dt_s * state.intensity[1]
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
-        drifted = np.array([spread[0], spread[0], spread[0], spread[1], spread[1], spread[1]])
-        diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
+        drifted = _each_axis(place, turn)
         diagonals[_VELOCITY] += drifted
         drifted *= 0.5 * dt_s
         diagonals[_POSE_VELOCITY] += drifted
         diagonals[_VELOCITY_POSE] += drifted
-        spread = [dt_s**2 / 3 * part for part in spread]
-    P.ravel()[_POSE] += _grown(spread, dt_s)
+        place, turn = dt_s**2 / 3 * place, dt_s**2 / 3 * turn
+    # never less than a doubt that grows with time
+    diagonals[_POSE] += _each_axis(
+        place + _LEAST2[0] + dt_s * _DOUBT2[0],
+        turn + _LEAST2[1] + dt_s * _DOUBT2[1],
+    )
     return MotionState(
         T=updated(state.T, dt_s * state.velocity),
         velocity=state.velocity,
@@ -101,13 +107,6 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
         information=state.information,
         elapsed_s=state.elapsed_s,
     )
-
-
-def _grown(spread: list[float], dt_s: float) -> list[float]:
-    """Variances of the pose after a step: the motion's, and never less than a doubt that grows with time."""
-    return [
-        part + least + dt_s * doubt for part, least, doubt in zip(spread, _LEAST2, _DOUBT2, strict=True) for _ in "xyz"
-    ]
 
 
 def correct(
@@ -123,9 +122,9 @@ def correct(
         kind: as for :func:`start`.
     """
     S_inverse = inverse_positive(predicted.pose_covariance + covariance)
-    gain = predicted.covariance[:, :6] @ S_inverse
-    step = gain @ innovation
-    P = predicted.covariance - gain @ predicted.covariance[:6]
+    gain = predicted.covariance[:, :6].dot(S_inverse)
+    step = gain.dot(innovation)
+    P = predicted.covariance - gain.dot(predicted.covariance[:6])
     intensity, information = _learn(predicted, S_inverse, innovation, dt_s, kind)
     return MotionState(
         T=updated(predicted.T, step[:6]),
@@ -139,21 +138,21 @@ def correct(
 
 def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
-    z, rows = (S_inverse @ innovation).tolist(), S_inverse.tolist()
-    intensities, informations = [], []
-    for i, (intensity, old) in enumerate(
-        zip(predicted.intensity.tolist(), predicted.information.tolist(), strict=True)
-    ):
-        part = range(3 * i, 3 * i + 3)  # translation, then rotation
+    z, rows = S_inverse.dot(innovation).tolist(), S_inverse.tolist()
+    pair = []
+    for i, (intensity, old) in enumerate(zip(predicted.intensity, predicted.information, strict=True)):
+        j, k, l = range(3 * i, 3 * i + 3)  # translation, then rotation
+        trace = rows[j][j] + rows[k][k] + rows[l][l]
+        squares = sum([element * element for row in rows[j : l + 1] for element in row[j : l + 1]])
         share = intensity * (dt_s**3 / 3 if kind == "velocity" else dt_s)
-        score = 0.5 * share * sum(z[j] * z[j] - rows[j][j] for j in part)
-        information = MEMORY * old + 0.5 * share**2 * sum(rows[j][k] * rows[j][k] for j in part for k in part)
+        score = 0.5 * share * (z[j] * z[j] + z[k] * z[k] + z[l] * z[l] - trace)
+        information = MEMORY * old + 0.5 * share**2 * squares
         log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
-        intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]))
-        informations.append(information)
-    return np.array(intensities), np.array(informations)
+        pair.append((min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]), information))
+    (of_place, known_of_place), (of_turn, known_of_turn) = pair
+    return (of_place, of_turn), (known_of_place, known_of_turn)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,27 +171,27 @@ class StillAxes:
     def pose(self, T_slice_model: FloatArray) -> FloatArray:
         """The pose there of a pose in the slice."""
         T = T_slice_model.copy()
-        T[:3, 3] += T[:3, :3] @ self.middle
-        return T if self.T_patient_slice is None else self.T_patient_slice @ T
+        T[:3, 3] += T[:3, :3].dot(self.middle)
+        return T if self.T_patient_slice is None else self.T_patient_slice.dot(T)
 
     def slice_pose(self, T: FloatArray) -> FloatArray:
         """``T_slice_model`` of a pose there."""
         placed = T.copy()
         if self.T_patient_slice is not None:
             placed[:3, 3] -= self.T_patient_slice[:3, 3]
-            placed[:3] = self.T_patient_slice[:3, :3].T @ placed[:3]
-        placed[:3, 3] -= placed[:3, :3] @ self.middle
+            placed[:3] = self.T_patient_slice[:3, :3].T.dot(placed[:3])
+        placed[:3, 3] -= placed[:3, :3].dot(self.middle)
         return placed
 
     def twist(self, T_slice_model: FloatArray) -> FloatArray:
         """(6, 6) that takes a twist at the model origin in slice axes to the one there."""
-        G = shifted(T_slice_model[:3, :3] @ self.middle)
-        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]) @ G
+        G = shifted(T_slice_model[:3, :3].dot(self.middle))
+        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]).dot(G)
 
     def slice_twist(self, T_slice_model: FloatArray) -> FloatArray:
         """The inverse of :meth:`twist`."""
-        G = shifted(-T_slice_model[:3, :3] @ self.middle)
-        return G if self.T_patient_slice is None else G @ _turned(self.T_patient_slice[:3, :3].T)
+        G = shifted(-T_slice_model[:3, :3].dot(self.middle))
+        return G if self.T_patient_slice is None else G.dot(_turned(self.T_patient_slice[:3, :3].T))
 
 
 def inverse_twist(G: FloatArray) -> FloatArray:
@@ -200,7 +199,7 @@ def inverse_twist(G: FloatArray) -> FloatArray:
     B = np.zeros((6, 6))
     R_inverse = G[3:, 3:].T
     B[:3, :3] = B[3:, 3:] = R_inverse
-    B[:3, 3:] = -R_inverse @ G[:3, 3:] @ R_inverse
+    B[:3, 3:] = -R_inverse.dot(G[:3, 3:]).dot(R_inverse)
     return B
 
 
@@ -210,8 +209,9 @@ def _turned(R: FloatArray) -> FloatArray:
     return B
 
 
-def _each_axis(pair: tuple[float, float]) -> FloatArray:
-    return np.repeat(np.array(pair, dtype=np.float64), 3)
+def _each_axis(place: float, turn: float) -> FloatArray:
+    """(6,) the same along every axis, and the same about every axis."""
+    return np.array([place, place, place, turn, turn, turn])
 
 
 #: places in a (12, 12) covariance, row by row, of the diagonals of its four blocks

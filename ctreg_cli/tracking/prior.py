@@ -20,7 +20,7 @@ from ctreg_cli.registration.matching import Matches, Scene, distinct, join, obse
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.registration.twins import Twin
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.single import difference, log_determinant, shifted, solve_positive
+from ctreg_cli.tracking.single import carried, difference, mahalanobis2, shifted
 
 #: probability that the frame is moved by hand from one slice to the next, or within a second; the most it may become
 JUMP_A_SLICE, JUMP_A_SECOND, MOST_JUMP = 0.01, 0.005, 0.5
@@ -143,12 +143,12 @@ class PastPrior:
 def _turned_over(prediction: Predicted, twin: Twin) -> tuple[FloatArray, FloatArray]:
     """The predicted pose (4, 4) of the frame with the motion of a twin done to it, and its (6, 6) covariance."""
     G = shifted(prediction.T[:3, :3] @ twin.transform[:3, 3])
-    return prediction.T @ twin.transform, G @ prediction.covariance @ G.T
+    return prediction.T @ twin.transform, carried(G, prediction.covariance)
 
 
 def _log_normal(x: FloatArray, S: FloatArray) -> float:
     """ln of the normal density of x (6,) with mean zero and covariance S (6, 6)."""
-    return -0.5 * (float(x @ solve_positive(S, x)) + log_determinant(S)) - 3 * math.log(2 * math.pi)
+    return -0.5 * sum(mahalanobis2(x, S)) - 3 * math.log(2 * math.pi)
 
 
 def _leads_there(matches: Matches, nearby: MostProbable) -> tuple[BoolArray, FloatArray]:

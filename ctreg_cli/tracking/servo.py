@@ -6,13 +6,15 @@ Gauss–Newton with a gain; straight spot paths) or kept from the desired featur
 curved paths). Stable while the symmetric part of ``Ĵ⁺ J`` is positive definite (eq. 17); its smallest eigenvalue is the
 margin, and means something only with the rotation columns brought to millimetres by the frame's size.
 
-One pose at a time and the seen rods only, in closed forms: this is what a tracked slice costs.
+One pose at a time and the seen rods only, in closed forms: this is what a tracked slice costs. What is made anew in
+every step is a NamedTuple, which costs half of a frozen dataclass.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,8 +90,7 @@ class Desired:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class View:
+class View(NamedTuple):
     """The desired features seen from a pose."""
 
     #: (k, 2) spots of this pose, and measured minus these, px
@@ -105,7 +106,7 @@ class View:
 
     def stepped(self, twist: FloatArray) -> View:
         """What is seen after a small twist (6,), to first order in spots and residuals."""
-        shift = (self.jacobian @ twist).reshape(-1, 2)
+        shift = self.jacobian.dot(twist).reshape(-1, 2)
         return View(
             spots_px=self.spots_px + shift,
             residual_px=self.residual_px - shift,
@@ -119,7 +120,7 @@ class View:
     def chi2(self) -> float:
         """Σ rᵀ W r."""
         r = self.residual_px[:, :, None]
-        return float((self.weight @ r).ravel() @ r.ravel())
+        return float((self.weight @ r).ravel().dot(r.ravel()))
 
     @property
     def rms_px(self) -> float:
@@ -130,7 +131,7 @@ class View:
     def sum_of_squares_px2(self) -> float:
         """Σ rᵀ r."""
         r = self.residual_px.ravel()
-        return float(r @ r)
+        return float(r.dot(r))
 
     def weighted(self, jacobian: FloatArray) -> FloatArray:
         """``W J`` (2k, 6) of a Jacobian (2k, 6)."""
@@ -169,8 +170,7 @@ def view(desired: Desired, T: FloatArray, crossing: Crossing | None = None) -> V
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ServoResult:
+class ServoResult(NamedTuple):
     """Where the servo ended, and the way there."""
 
     T: FloatArray
@@ -179,6 +179,8 @@ class ServoResult:
     covariance: FloatArray
     #: (6, 6) ``Jᵀ W J`` with the true Jacobian there
     information: FloatArray
+    #: Σ rᵀ W r of what is left
+    chi2: float
     iterations: int
     converged: bool
     #: smallest eigenvalue of the symmetric part of Ĵ⁺J at the end
@@ -237,17 +239,19 @@ def servo(
         numpy.linalg.LinAlgError: the spots do not determine the pose, or a rod came to lie in the slice on the way.
     """
     options = options or ServoOptions()
-    unit = _unit(model.size_mm)
+    size_mm = model.size_mm
     here = view(desired, T, crossing)
     law = _Law.of(here, jacobian)
-    path = [(T, here, law.margin(here, model.size_mm))] if keep_path else []
+    path = [(T, here, law.margin(here, size_mm))] if keep_path else []
     iterations, before_sd = 0, 0.0
     looks_no_more = jacobian is None and options.gain == 1.0 and not keep_path
     while True:
         step, moved_sd2 = law.full_step(here)
+        if not math.isfinite(moved_sd2):
+            raise np.linalg.LinAlgError("a rod came to lie in the slice")
         converged = (
             moved_sd2 <= options.spot_tolerance_sd**2
-            or max(map(abs, (step * unit).tolist())) <= options.step_tolerance * model.size_mm
+            or _greatest_mm(step, size_mm) <= options.step_tolerance * size_mm
             or here.sum_of_squares_px2 <= options.residual_tolerance**2 * here.residual_px.size
         )
         if converged or iterations >= options.max_iterations:
@@ -256,35 +260,31 @@ def servo(
             T, here, iterations, converged = updated(T, step), here.stepped(step), iterations + 1, True
             break
         before_sd = math.sqrt(moved_sd2)
-        step *= options.gain
-        turn = math.sqrt(float(step[3:] @ step[3:]))
-        if turn > _MAX_TURN_RAD:
-            step *= _MAX_TURN_RAD / turn
+        turn = options.gain * math.hypot(*step[3:].tolist())
+        step *= options.gain if turn <= _MAX_TURN_RAD else options.gain * _MAX_TURN_RAD / turn
         iterations += 1
         T = updated(T, step)
         here = view(desired, T)
-        if not math.isfinite(float(here.residual_px.sum())):
-            raise np.linalg.LinAlgError("a rod came to lie in the slice")
         if jacobian is None:
             law = _Law.of(here, None)
         if keep_path:
-            path.append((T, here, law.margin(here, model.size_mm)))
+            path.append((T, here, law.margin(here, size_mm)))
     return ServoResult(
         T=T,
         view=here,
         covariance=law.covariance(here),
         information=law.information if jacobian is None else here.weighted(here.jacobian).T @ here.jacobian,
+        chi2=here.chi2,
         iterations=iterations,
         converged=converged,
-        margin=law.margin(here, model.size_mm) if converged else -np.inf,
+        margin=law.margin(here, size_mm) if converged else -np.inf,
         path_T=np.stack([p for p, _, _ in path]) if keep_path else None,
         path_px=np.stack([seen.spots_px for _, seen, _ in path]) if keep_path else None,
         path_margin=np.array([m for _, _, m in path]) if keep_path else None,
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Law:
+class _Law(NamedTuple):
     """``ξ = Ĵ⁺ (s* − s)`` with one Ĵ."""
 
     #: (2k, 6) ``W Ĵ``, and (6, 6) ``Ĵᵀ W Ĵ``
@@ -297,7 +297,7 @@ class _Law:
     def of(cls, here: View, jacobian: FloatArray | None) -> _Law:
         J = here.jacobian if jacobian is None else jacobian
         WJ = here.weighted(J)
-        information = WJ.T @ J
+        information = WJ.T.dot(J)
         return cls(
             weighted=WJ,
             information=information,
@@ -306,9 +306,9 @@ class _Law:
 
     def full_step(self, here: View) -> tuple[FloatArray, float]:
         """The twist (6,) of gain one, and how far it would move the spots: Σ ‖Δs‖² in sd, to first order."""
-        gradient = here.residual_px.reshape(-1) @ self.weighted
+        gradient = here.residual_px.reshape(-1).dot(self.weighted)
         step = solve_positive(self.information, gradient)
-        return step, float(gradient @ step)
+        return step, float(gradient.dot(step))
 
     def margin(self, here: View, size_mm: float) -> float:
         """:func:`stability_margin`; one where Ĵ is the Jacobian itself."""
@@ -323,6 +323,12 @@ class _Law:
         spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)
         covariance: FloatArray = spread.reshape(6, -1) @ influence.T
         return covariance
+
+
+def _greatest_mm(twist: FloatArray, size_mm: float) -> float:
+    """The greatest part of a twist (6,), rotation measured in frame sizes, mm."""
+    x, y, z, *turn = map(abs, twist.tolist())
+    return float(max(x, y, z, size_mm * max(turn)))
 
 
 def _unit(size_mm: float) -> FloatArray:

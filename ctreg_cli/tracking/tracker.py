@@ -50,7 +50,7 @@ from ctreg_cli.tracking.settle import (
     reconciled,
     straightened,
 )
-from ctreg_cli.tracking.single import Crossing, cross, difference, model_lines
+from ctreg_cli.tracking.single import Crossing, carried, cross, difference, model_lines
 from ctreg_cli.tracking.variants import with_other_rods
 from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
 
@@ -181,12 +181,12 @@ class Tracker:
         axes = self._axes(info)
         T = axes.slice_pose(moved.T)
         G = axes.slice_twist(T)
-        covariance = G @ moved.pose_covariance @ G.T
+        covariance = carried(G, moved.pose_covariance)
         crossing = cross(T, model_lines(model))
         spread_mm2 = spread(crossing, covariance)
         reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
         # how far along a rod that moves the slice
-        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height()
+        slack = (0.5 * (info.thickness_mm or 0.0) + 3 * reach) * crossing.mm_per_height
         visible = (crossing.lambda_mm >= -slack) & (crossing.lambda_mm <= model.lengths + slack)
         s = scale.mm_per_px
         return Prediction(
@@ -298,7 +298,8 @@ class Tracker:
     ) -> tuple[_Followed | None, str]:
         model = self.model
         T, crossing = prediction.T, prediction.crossing
-        spot_of_rod = Outlook(model, scene, T, crossing).assigned(prediction.covariance, prediction.spread_mm2)
+        outlook = Outlook(model, scene, T, crossing)
+        spot_of_rod = outlook.assigned(prediction.covariance, prediction.spread_mm2)
         for _ in range(_ASSIGNMENTS):
             rods = np.nonzero(spot_of_rod >= 0)[0]
             if len(rods) < CHECKABLE_MATCHES:
@@ -321,9 +322,9 @@ class Tracker:
             if not moved.converged:
                 return None, "the servo did not converge"
             T = moved.T
-            outlook = Outlook(model, scene, T, moved.view.crossing if all_seen else None)
+            outlook = Outlook(model, scene, T, moved.view.crossing if all_seen else None, outlook.noise_mm)
             crossing = outlook.crossing
-            if all_seen and len(rods) == len(scene.xy_mm) and moved.view.chi2 < GATE_SD**2:
+            if all_seen and len(rods) == len(scene.xy_mm) and moved.chi2 < GATE_SD**2:
                 break  # no rod or spot is left over, and none can be outside its gate
             again = outlook.assigned(moved.covariance)
             if np.array_equal(again, spot_of_rod):
@@ -548,7 +549,7 @@ class Tracker:
                 return replace(past.tracked, registration=sure, begins=False)
         axes = self._axes(info)
         T, G = axes.pose(best.T_slice_model), axes.twist(best.T_slice_model)
-        C = G @ best.covariance @ G.T
+        C = carried(G, best.covariance)
         kind = self.options.prediction
         time_s, interval_s = info.time_s, 1.0
         if past is not None and prediction is not None:
@@ -558,7 +559,7 @@ class Tracker:
                 time_s = past.time_s + prediction.dt_s
         timed = past is not None and (past.time_s is None) == (time_s is None)
         if prediction is None or not timed:
-            learnt = past.motion.intensity if past is not None and timed else None
+            learnt = past.motion.intensity if past is not None and timed else motion.FIRST_INTENSITY
             state = motion.start(T, C, kind, learnt)
         else:
             innovation = difference(T, prediction.motion.T)
@@ -592,7 +593,7 @@ class Tracker:
         if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
         G = motion.inverse_twist(to_still)
-        return Velocity(twist=G @ state.velocity, covariance=G @ state.covariance[6:, 6:] @ G.T)
+        return Velocity(twist=G @ state.velocity, covariance=carried(G, state.covariance[6:, 6:]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

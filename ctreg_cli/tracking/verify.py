@@ -9,9 +9,8 @@ sure; with one it is not refused, but looked into (:mod:`~ctreg_cli.tracking.tra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -42,7 +41,7 @@ from ctreg_cli.tracking.single import (
     inverse_2x2,
     levers,
     log_determinant,
-    solve_positive,
+    mahalanobis2,
     turned_by,
 )
 
@@ -100,14 +99,14 @@ def verified(
     seen, T, C = moved.view, moved.T, moved.covariance
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
-    chi2 = seen.chi2
+    chi2 = moved.chi2
     if len(rods) < CHECKABLE_MATCHES or float(chdtrc(dof, chi2)) < INFLATE_P or not _allowed(scene, T):
         return None
     if _is_vaguer(C, VAGUE_POSE_RAD) or _is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
         return None
     crossings = outlook.crossing
     missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
-    if not outlook.may_be_seen()[rods].all() or len(missing) > len(rods):
+    if not all(outlook.may_be_seen()[rods].tolist()) or len(missing) > len(rods):
         return None
     apart2 = _least_distance2(crossings.xy_mm, rods, missing)
     if apart2 < _reach_mm(model) ** 2 or outlook.rod_end_shift_mm(rods) > 0:
@@ -118,12 +117,10 @@ def verified(
     protection = without.protection_mm(_protected(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
         return None
-    innovation = difference(T, T_predicted)
-    S = predicted_covariance + C
-    distance2 = float(innovation @ solve_positive(S, innovation))
-    if distance2 > _ODD_INNOVATION2:
+    innovation = mahalanobis2(difference(T, T_predicted), predicted_covariance + C)
+    if innovation[0] > _ODD_INNOVATION2:
         return None
-    odds = _log_odds(model, scene, crossings.xy_mm, moved, chi2, rods, missing, distance2, S)
+    odds = _log_odds(model, scene, crossings.xy_mm, moved, without, rods, missing, innovation)
     if not odds > ACCEPT_LOG_ODDS:
         return None
     residual = seen.residual_px / scale.mm_per_px
@@ -136,7 +133,7 @@ def verified(
         residual_px=_kept(residual),
         lambda_mm=_kept(seen.crossing.lambda_mm),
         missing_rods=_kept(missing),
-        missing_px=_kept(crossings.xy_mm[missing] / scale.mm_per_px),
+        missing_px=_kept(crossings.xy_mm.take(missing, axis=0) / scale.mm_per_px),
         rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
@@ -257,8 +254,7 @@ def _least_distance2(xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> fl
     return float(d_x.min())
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LeftOut:
+class LeftOut(NamedTuple):
     """What the other spots say of each of k spots (the hat matrix of regression: no fit is repeated)."""
 
     #: (6, 2k) ``C Jᵀ`` and (k, 2, 2) ``(Σ − J C Jᵀ)⁻¹``
@@ -268,21 +264,22 @@ class LeftOut:
     pull: FloatArray
     #: (k,) squared distance of each spot from where the others predict it, in sd
     distance2: FloatArray
-    #: (k, 2, 2) covariance of that prediction and the spot, and its determinant
+    #: (k, 2, 2) covariance of that prediction and the spot, and its determinant; and that of the spot's own covariance
     gate: FloatArray
     gate_det: FloatArray
+    own_det: FloatArray
 
     @classmethod
     def of(cls, moved: ServoResult) -> LeftOut | None:
         """None where a spot alone fixes a direction of the pose: the others do not predict it."""
         own, J = moved.view.covariance_px, moved.view.jacobian
-        influence = moved.covariance @ J.T
+        influence = moved.covariance.dot(J.T)
         k = len(own)
         slack = own - J.reshape(k, 2, 6) @ influence.reshape(6, k, 2).transpose(1, 0, 2)
         slack_det, own_det = determinant_2x2(slack), determinant_2x2(own)
-        if float((slack_det - _FIXES_ALONE * own_det).min()) <= 0 or float(slack[:, 0, 0].min()) <= 0:
+        if min((slack_det - _FIXES_ALONE * own_det).tolist()) <= 0 or min(slack[:, 0, 0].tolist()) <= 0:
             return None
-        left = inverse_2x2(slack)
+        left = inverse_2x2(slack, slack_det)
         r = moved.view.residual_px
         pull = (left @ r[:, :, None])[:, :, 0]
         # det(Σ L Σ) = det(Σ)² / det(slack)
@@ -293,22 +290,29 @@ class LeftOut:
             distance2=(pull * r).sum(axis=1),
             gate=own @ left @ own,
             gate_det=own_det * own_det / slack_det,
+            own_det=own_det,
         )
 
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
         """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
         k, p = len(self.left), len(points)
-        G = levers(points @ moved.T[:3, :3].T)
+        G = levers(points.dot(moved.T[:3, :3].T))
         # (p, k, 3, 2)
-        moves = (G.reshape(3 * p, 6) @ self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
+        moves = G.reshape(3 * p, 6).dot(self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
         variance = np.empty((p, k + 1, 3, 3))
         variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
         variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
         level = np.sqrt(np.linalg.eigvalsh(variance)[..., -1])
-        level *= math.sqrt(float(chdtri(3, risk / (k + 1))))
-        separation = moves @ self.pull[:, :, None]
-        level[:, :k] += np.sqrt((separation * separation).sum(axis=(2, 3)))
+        level *= _sd_at_risk(risk, k)
+        separation = (moves @ self.pull[:, :, None])[..., 0]
+        level[:, :k] += np.sqrt((separation * separation).sum(axis=-1))
         return np.asarray(level.max(axis=1))
+
+
+@lru_cache(maxsize=64)
+def _sd_at_risk(risk: float, n_matches: int) -> float:
+    """The K of :mod:`~ctreg_cli.registration.integrity`: how many sd of a target's error the ``risk`` allows."""
+    return math.sqrt(float(chdtri(3, risk / (n_matches + 1))))
 
 
 def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray, apart2: float) -> bool:
@@ -316,7 +320,7 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
 
     ``apart2``: least squared distance of two of the rods' crossings, mm².
     """
-    if float(without.distance2.max()) > ODD_D2:
+    if max(without.distance2.tolist()) > ODD_D2:
         return True
     k = len(spots)
     free = len(scene.xy_mm) - k
@@ -327,8 +331,8 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
             return True
     else:
         # the rods' own spots: far from each other by more than the widest gate, and what two may lie off
-        widest = CONTEST_D2 * float((without.gate[:, 0, 0] + without.gate[:, 1, 1]).max())
-        off = float(np.abs(moved.view.residual_px).max()) * math.sqrt(2.0)
+        widest = CONTEST_D2 * max((without.gate[:, 0, 0] + without.gate[:, 1, 1]).tolist())
+        off = max(map(abs, moved.view.residual_px.ravel().tolist())) * math.sqrt(2.0)
         if apart2 > (2.0 * math.sqrt(widest) + off) ** 2:
             return False
     predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.pull[:, :, None])[:, :, 0]
@@ -343,28 +347,31 @@ def _log_odds(
     scene: Scene,
     xy_mm: FloatArray,
     moved: ServoResult,
-    chi2: float,
+    without: LeftOut,
     rods: IntArray,
     missing: IntArray,
-    distance2: float,
-    S: FloatArray,
+    innovation: tuple[float, float],
 ) -> float:
-    """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone."""
+    """:func:`ctreg_cli.registration.evidence.log_odds` of one hypothesis whose prior is the prediction alone.
+
+    ``innovation``: squared distance from the prediction, and ln det of its covariance.
+    """
     there = xy_mm.take(np.concatenate([rods, missing]) if len(missing) else rods, axis=0)
     centre = there.sum(axis=0) / len(there)
     away = there - centre
-    reach2 = max(_NEIGHBOURHOOD**2 * float((away * away).sum(axis=1).max()), (_LEAST_REACH * model.size_mm) ** 2)
+    reach2 = max(_NEIGHBOURHOOD**2 * max((away * away).sum(axis=1).tolist()), (_LEAST_REACH * model.size_mm) ** 2)
     m = n = len(rods)
     if len(scene.xy_mm) > n:
         away = scene.xy_mm - centre
         m = max(int(np.count_nonzero((away * away).sum(axis=1) <= reach2)), n)
-    volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_determinant(S)), 0.0)
-    log_weights = float(np.log(determinant_2x2(moved.view.weight)).sum())
+    distance2, log_det = innovation
+    volume = min(-0.5 * distance2 + 0.5 * (log_determinant(moved.covariance) - log_det), 0.0)
+    log_weights = -sum(map(math.log, without.own_det.tolist()))
     return (
         volume
         + n * (math.log(P_SEEN) - math.log(2 * math.pi))
         + 0.5 * log_weights
-        - 0.5 * chi2
+        - 0.5 * moved.chi2
         + n * math.log(math.pi * reach2)
         + math.lgamma(m - n + 0.5)
         - math.lgamma(m + 0.5)

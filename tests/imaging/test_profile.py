@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctreg_cli.imaging.plateau import LongSpots
-from ctreg_cli.imaging.profile import FLATNESS, N_PARAMETERS, Rows, moved
+from ctreg_cli.imaging.profile import FLATNESS, LOG_HEIGHT, N_PARAMETERS, Rows, moved
 from ctreg_cli.imaging.segmentation import find_spots
 from tests.imaging.rendering import as_slice, render_rod
 
@@ -37,6 +37,24 @@ def test_the_derivatives_are_those_of_the_profile(long: tuple[bool, bool] | None
         numeric = (profile(moved(PARAMETERS, step)) - profile(moved(PARAMETERS, -step))) / (2 * e)
         rows.evaluate(PARAMETERS)
         np.testing.assert_allclose(rows.by_spot[:, i], numeric, atol=2e-6 * np.abs(numeric).max() + 1e-6)
+
+
+def test_pixels_that_are_left_out_take_part_again() -> None:
+    """A clipped pixel takes no part where the profile is brighter, and does in the next evaluation where it is not."""
+    v, u = (axis.ravel().astype(float) for axis in np.mgrid[-6:7, -6:7])
+    values, dark = np.full((2, u.size), 40.0), PARAMETERS.copy()
+    dark[LOG_HEIGHT] -= 6.0
+    rows = Rows(u, v, values, values > 0, np.ones_like(values))
+    expected = rows.evaluate(dark)
+    bright = rows.evaluate(PARAMETERS)
+    left_out = (rows.by_spot == 0.0).all(axis=1)
+    assert left_out.any(axis=1).all()
+    assert not left_out.all()
+    unclipped = Rows(u, v, values, None, np.ones_like(values))
+    unclipped.evaluate(PARAMETERS)
+    by_spot = np.where(left_out[:, None], 0.0, unclipped.by_spot)
+    np.testing.assert_allclose(bright, by_spot @ by_spot.transpose(0, 2, 1))
+    np.testing.assert_array_equal(rows.evaluate(dark), expected)
 
 
 def test_a_part_of_the_spots_has_their_rows() -> None:

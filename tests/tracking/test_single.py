@@ -23,6 +23,7 @@ def test_crossings_and_motion_field(seed: int) -> None:
     np.testing.assert_allclose(crossing.xy_mm, projection.xy_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.lambda_mm, projection.lambda_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.slope, projection.slope, rtol=1e-12)
+    np.testing.assert_allclose(crossing.mm_per_height, np.hypot(1.0, np.hypot(*projection.slope.T)), rtol=1e-12)
     np.testing.assert_allclose(crossing.jacobian, motion_field(T, projection), rtol=1e-12, atol=1e-12)
 
 
@@ -70,13 +71,18 @@ def test_small_positive_definite_systems() -> None:
     np.testing.assert_allclose(A @ single.solve_positive(A, b), b, atol=1e-9)
     np.testing.assert_allclose(single.inverse_positive(A), np.linalg.inv(A), rtol=1e-9, atol=1e-12)
     assert single.log_determinant(A) == pytest.approx(np.linalg.slogdet(A)[1])
+    distance2, log_determinant = single.mahalanobis2(b, A)
+    assert distance2 == pytest.approx(b @ np.linalg.solve(A, b))
+    assert log_determinant == pytest.approx(single.log_determinant(A))
     for singular in (np.zeros((6, 6)), -A):
         for function in (single.inverse_positive, single.log_determinant):
             with pytest.raises(np.linalg.LinAlgError):
                 function(singular)
     blocks = rng.normal(size=(5, 2, 2))
     np.testing.assert_allclose(single.inverse_2x2(blocks) @ blocks, np.tile(np.eye(2), (5, 1, 1)), atol=1e-9)
-    np.testing.assert_allclose(single.determinant_2x2(blocks), np.linalg.det(blocks))
+    determinants = single.determinant_2x2(blocks)
+    np.testing.assert_allclose(determinants, np.linalg.det(blocks))
+    np.testing.assert_array_equal(single.inverse_2x2(blocks, determinants), single.inverse_2x2(blocks))
 
 
 def test_how_a_twist_moves_points() -> None:
