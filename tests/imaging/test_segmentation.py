@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, find_spots, measure_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo
@@ -181,7 +182,7 @@ def test_what_is_no_rod_is_left_out_with_the_reason(values: object, reason: str)
     assert reason in {r.reason for r in spots.rejected}
 
 
-@pytest.mark.parametrize("radius_px", [10, 20, 60])
+@pytest.mark.parametrize("radius_px", [13, 20, 60])
 def test_what_is_far_too_large_is_named_once(radius_px: int) -> None:
     row, column = np.mgrid[:160, :160]
     body = 2000.0 * (np.hypot(row - 80, column - 76) < radius_px) + np.random.default_rng(2).normal(
@@ -203,6 +204,45 @@ def test_thick_rods_with_flat_tops_are_all_found_and_well(diameter_mm: float, mm
     spots = find_spots(as_slice(np.minimum(image + noise, 3071), mm_per_px=mm_per_px))
     distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).min(axis=0)
     assert distance.max() < 0.03
+
+
+@pytest.mark.parametrize("ceiling", [np.inf, 3071.0])
+@pytest.mark.parametrize(("diameter_mm", "mm_per_px"), [(4.0, 0.3), (8.0, 0.3), (5.5, 0.5), (8.0, 0.5), (7.0, 0.8)])
+def test_rods_thicker_than_usual_are_found_if_nothing_stands_out_more(
+    diameter_mm: float, mm_per_px: float, ceiling: float
+) -> None:
+    """No diameter is given; the smallest windows lie within such a rod, and show nothing."""
+    rod = {"blur_mm": 0.4, "diameter_mm": diameter_mm, "mm_per_px": mm_per_px, "contrast": 5000.0}
+    image, uv = render_grid(np.random.default_rng(6), 3, int(34 + 8 / mm_per_px), **rod)
+    noisy = np.minimum(image + np.random.default_rng(7).normal(0.0, 10.0, image.shape), ceiling)
+    slice_ = as_slice(noisy, mm_per_px=mm_per_px)
+    spots = find_spots(slice_)
+    assert len(spots) == len(uv)
+    assert not spots.rejected
+    assert np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).min(axis=0).max() < 0.03
+    measured = measure_spots(slice_, spots.uv_px + np.random.default_rng(8).uniform(-2, 2, spots.uv_px.shape), 5.0)
+    nearest = np.linalg.norm(measured.uv_px[:, None] - spots.uv_px, axis=2).argmin(axis=0)
+    assert (np.abs(measured.uv_px[nearest] - spots.uv_px) < spots.sd_px).all()  # windows may differ by a pixel
+
+
+def test_what_is_thick_and_fainter_than_the_rods_is_left_out(image: np.ndarray) -> None:
+    """As bones are beside metal; where the rods' diameter is known it is left out however strong it is."""
+    values = image + render_rod(SHAPE, (60.0, 100.0), diameter_mm=8.0, contrast=600.0)
+    spots = find_spots(as_slice(values))
+    np.testing.assert_allclose(spots.uv_px[np.argsort(spots.uv_px[:, 0])], UV, atol=0.05)
+    assert {r.reason for r in spots.rejected} == {"too_large"}
+    strong = as_slice(image + render_rod(SHAPE, (60.0, 100.0), diameter_mm=8.0, contrast=3000.0))
+    assert len(find_spots(strong)) == 4
+    assert len(find_spots(strong, SegmentationOptions(rod_diameter_mm=(1.0, 2.0)))) == 3
+
+
+def test_all_that_is_left_out_is_counted_even_where_not_all_is_listed() -> None:
+    noise = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (400, 400)), 1.5)
+    spots = find_spots(as_slice(1000.0 + 200.0 * noise / noise.std()))
+    assert sum(spots.n_rejected.values()) > len(spots.rejected) > 90
+    assert set(spots.n_rejected) >= {r.reason for r in spots.rejected}
+    few = find_spots(as_slice(render_rod((96, 96), (1.3, 64.0))))
+    assert few.n_rejected == {"at_border": 1}
 
 
 def test_a_bone_within_a_body_is_named_too() -> None:
