@@ -55,6 +55,9 @@ CUT, CUT_SD_PX, CUT_POWER = 1.5, 0.0042, 1.2
 #: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
 #: variance is twice that of the linear law where it stands out by so many sd of the noise
 FAINT_SD = 5.0
+#: a smooth kernel's noise makes peaks of the height of its whole sd, not of what differs from pixel to pixel; but part
+#: of what seems to be such noise is structure, which hides no rod
+SMOOTH_NOISE_SHARE = 0.7
 #: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
@@ -73,7 +76,7 @@ class Centres:
     uv_px: FloatArray
     #: (k, 2, 2) px²
     covariance_px: FloatArray
-    #: (k,) sd of what differs from pixel to pixel about each blob, stored units
+    #: (k,) sd of the noise that a spot must stand out of, stored units
     noise: FloatArray
 
 
@@ -125,7 +128,8 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     if not found.all():
         uv = np.where(found[:, None], uv, blobs.centre)
         covariance = np.where(found[:, None, None], covariance, blobs.moments)
-    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=law.rough)
+    noise = np.maximum(law.rough, SMOOTH_NOISE_SHARE * law.smooth)
+    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=noise)
 
 
 def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:

@@ -236,10 +236,25 @@ def test_what_is_thick_and_fainter_than_the_rods_is_left_out(image: np.ndarray) 
     assert len(find_spots(strong, SegmentationOptions(rod_diameter_mm=(1.0, 2.0)))) == 3
 
 
+@pytest.mark.parametrize("blur_px", [0.7, 1.0, 1.5])
+def test_a_smooth_kernel_s_noise_makes_few_spots_and_hides_no_rod(blur_px: float) -> None:
+    """CT fluoroscopy: neighbours' noise goes together, and its peaks look like faint spots."""
+    n_false = []
+    for seed in range(5):
+        noise = gaussian_filter(np.random.default_rng(seed).normal(0.0, 1.0, (256, 256)), blur_px)
+        rods = sum(render_rod((256, 256), (3 * u / 2, 2 * v)) for u, v in UV)
+        spots = find_spots(as_slice(rods + 80.0 * noise / noise.std()))
+        error = np.linalg.norm(spots.uv_px[:, None] - UV * (1.5, 2.0), axis=2)
+        assert (error.argmin(axis=0) < 3).all()  # the rods come first
+        assert error.min(axis=0).max() < 1.0
+        n_false.append(len(spots) - 3)
+    assert np.mean(n_false) < 0.5 * (DEFAULT_OPTIONS.max_spots - 3)  # judged pixel by pixel they fill all places
+
+
 def test_all_that_is_left_out_is_counted_even_where_not_all_is_listed() -> None:
     noise = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (400, 400)), 1.5)
     spots = find_spots(as_slice(1000.0 + 200.0 * noise / noise.std()))
-    assert sum(spots.n_rejected.values()) > len(spots.rejected) > 90
+    assert sum(spots.n_rejected.values()) > len(spots.rejected) > 80
     assert set(spots.n_rejected) >= {r.reason for r in spots.rejected}
     few = find_spots(as_slice(render_rod((96, 96), (1.3, 64.0))))
     assert few.n_rejected == {"at_border": 1}
