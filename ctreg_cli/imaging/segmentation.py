@@ -41,11 +41,11 @@ Polarity = Literal["bright", "dark", "auto"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentationOptions:
-    """Defaults suit CT and MR slices of any scanner; every field is an option of ``ctreg segment``."""
+    """Defaults suit CT and MR slices of any scanner; commands set the polarity, and diameters from their frame file."""
 
     #: whether rods are brighter or darker than what surrounds them; ``auto`` takes what stands out more
     polarity: Polarity = "bright"
-    #: (least, greatest) rod diameter, mm; sets the expected size where the slice has a scale
+    #: (least, greatest) rod diameter, mm; the greatest sets the expected size where the slice has a scale
     rod_diameter_mm: tuple[float, float] | None = None
     #: at most so many spots a slice, the best ones
     max_spots: int = 40
@@ -147,7 +147,7 @@ def _find(slice_: Slice, options: SegmentationOptions, *, bright: bool) -> Spots
     if thick:
         spots = _spots_of(image, [*groups, *thick], limits, options, rejections)
     wide = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) + COARSE_PX > limits.width_px
-    rejections.add(_middles_of_unseen(boxes[wide], spots, rejections), "too_large")
+    rejections.add(_middles_of_unseen(boxes[wide], spots, rejections), "too_large", first=True)
     return rejections.of(spots)
 
 
@@ -315,11 +315,12 @@ class _Rejections:
     spots: list[RejectedSpot] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
 
-    def add(self, uv: FloatArray | IntArray, reason: str) -> None:
+    def add(self, uv: FloatArray | IntArray, reason: str, *, first: bool = False) -> None:
+        """Count candidates (k, 2), and list them, after all others or before them, as far as there is room."""
         if len(uv):
             self.counts[reason] += len(uv)
-            room = MAX_REJECTED - len(self.spots)
-            self.spots += [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:room]]
+            new = [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:MAX_REJECTED]]
+            self.spots = [*new, *self.spots][:MAX_REJECTED] if first else [*self.spots, *new][:MAX_REJECTED]
 
     def of(self, spots: Spots) -> Spots:
         """The spots with these rejections instead of their own, but for what is the inside of a spot."""

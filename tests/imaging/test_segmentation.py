@@ -98,6 +98,27 @@ def test_the_same_picture_in_other_numbers_gives_the_same_centres(image: np.ndar
     np.testing.assert_allclose(centres(as_slice(image / 16 + 30, dtype=np.uint8)), expected, atol=0.03)
 
 
+@pytest.mark.parametrize(("factor", "offset"), [(1e-6, 0.0), (1 / 4095, 0.25), (1e6, -3e8), (1e-200, 0.0)])
+def test_floating_point_pixels_may_have_any_range(image: np.ndarray, factor: float, offset: float) -> None:
+    expected = find_spots(as_slice(np.rint(image)))
+    spots = find_spots(as_slice(np.rint(image) * factor + offset, dtype=np.float64))
+    assert len(spots) == 3
+    np.testing.assert_allclose(spots.uv_px, expected.uv_px, atol=1e-3)
+    np.testing.assert_allclose(spots.contrast, expected.contrast * factor, rtol=1e-6)
+    np.testing.assert_allclose(spots.covariance_px, expected.covariance_px, rtol=0.05)
+    measured = measure_spots(as_slice(np.rint(image) * factor + offset, dtype=np.float64), UV, 4.0)
+    assert np.linalg.norm(measured.uv_px[:, None] - expected.uv_px, axis=2).min(axis=0).max() < 1e-3
+
+
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_no_numbers_are_no_image(image: np.ndarray, nothing: float) -> None:
+    values = np.rint(image)
+    values[:20] = values[20:25, 20:24] = nothing
+    spots = find_spots(as_slice(values, dtype=np.float64))
+    np.testing.assert_allclose(spots.uv_px, find_spots(as_slice(image)).uv_px, atol=1e-3)
+    assert np.isfinite(spots.covariance_px).all()
+
+
 def test_contrast_is_in_the_units_of_the_image(image: np.ndarray) -> None:
     hounsfield = find_spots(as_slice(image + 1024, intercept=-1024.0)).contrast
     doubled = find_spots(as_slice(image + 1024, slope=2.0)).contrast
@@ -256,6 +277,10 @@ def test_all_that_is_left_out_is_counted_even_where_not_all_is_listed() -> None:
     spots = find_spots(as_slice(1000.0 + 200.0 * noise / noise.std()))
     assert sum(spots.n_rejected.values()) > len(spots.rejected) > 80
     assert set(spots.n_rejected) >= {r.reason for r in spots.rejected}
+    row, column = np.mgrid[:400, :400]
+    body = np.where(np.hypot(row - 200, column - 190) < 40, 3071.0, 1000.0 + 200.0 * noise / noise.std())
+    large = find_spots(as_slice(body)).rejected
+    assert min(np.hypot(r.u_px - 190, r.v_px - 200) for r in large) < 4.0  # what one sees first is listed first
     few = find_spots(as_slice(render_rod((96, 96), (1.3, 64.0))))
     assert few.n_rejected == {"at_border": 1}
 
