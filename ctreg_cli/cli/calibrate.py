@@ -44,6 +44,7 @@ def calibrate(
     from ctreg_cli.io.atomic import AtomicFile
     from ctreg_cli.io.calibration_file import calibration_to_yaml
     from ctreg_cli.io.rod_file import load_rod_model
+    from ctreg_cli.pipeline import expecting
     from ctreg_cli.pipeline import segment as segment_slices
     from ctreg_cli.registration.calibrate import calibrate as calibrate_slices
     from ctreg_cli.registration.options import RegistrationOptions
@@ -55,7 +56,8 @@ def calibrate(
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     file = None if output == STANDARD_OUTPUT else AtomicFile(output)
     try:
-        found = segment_slices(warned(source, talk), SegmentationOptions(polarity=polarity.value))
+        segmentation = expecting(rod_model, SegmentationOptions(polarity=polarity.value))
+        found = segment_slices(warned(source, talk), segmentation)
         slices = list(talk.progress(found, total=len(source), what="segment"))
         run = calibrate_slices(slices, rod_model, options=RegistrationOptions(use_mount=use_mount))
         text = calibration_to_yaml(run.calibration)

@@ -72,7 +72,7 @@ def refine(
     from ctreg_cli.cli.run import choose_scale, open_inputs, warned
     from ctreg_cli.imaging.segmentation import SegmentationOptions
     from ctreg_cli.io.rod_file import load_rod_model, rod_model_to_yaml, save_rod_model
-    from ctreg_cli.pipeline import segment
+    from ctreg_cli.pipeline import expecting, segment
     from ctreg_cli.registration.bundle import refine_rods
     from ctreg_cli.registration.options import RegistrationOptions
 
@@ -81,7 +81,7 @@ def refine(
     frame = load_rod_model(model)
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     choice = choose_scale(scale, calibration, source, frame, talk)
-    found = segment(warned(source, talk), SegmentationOptions(polarity=polarity.value))
+    found = segment(warned(source, talk), expecting(frame, SegmentationOptions(polarity=polarity.value)))
     slices = list(talk.progress(found, total=len(source) or None, what="segment"))
     refinement = refine_rods(
         slices,

@@ -30,7 +30,7 @@ def segment(
     import sys
     from dataclasses import asdict
 
-    from ctreg_cli.cli.console import Talk
+    from ctreg_cli.cli.console import Talk, counted
     from ctreg_cli.cli.run import Watched, close, consume, open_inputs
     from ctreg_cli.cli.summary import SpotTally
     from ctreg_cli.imaging.segmentation import SegmentationOptions
@@ -58,7 +58,8 @@ def segment(
         index = spot_slice.index or 0
         if overlays and slice_:
             overlays.draw_spots(slice_, spot_slice, index)
-        talk.explain(f"slice {index} ({spot_slice.info.source}): {len(spot_slice.spots)} spots")
+        left_out = f"; left out: {counted(n)}" if (n := spot_slice.spots.n_rejected) else ""
+        talk.explain(f"slice {index} ({spot_slice.info.source}): {len(spot_slice.spots)} spots{left_out}")
 
     results = numbered(segment_slices(watched, segmentation))
     consume(results, sinks, on_result, talk, total=len(source), what="segment")

@@ -101,7 +101,7 @@ class SpotTally:
     def add(self, spot_slice: SpotSlice) -> None:
         self.counts.append(len(spot_slice.spots))
         self.n_unreadable += bool(spot_slice.problem)
-        self.rejected.update(spot.reason for spot in spot_slice.spots.rejected)
+        self.rejected.update(spot_slice.spots.n_rejected)
 
     def rows(self) -> list[tuple[str, str]]:
         """Names and values for the table."""

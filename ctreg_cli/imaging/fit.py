@@ -10,8 +10,8 @@ from ctreg_cli.imaging.profile import CENTRE, FLATNESS, GRADIENT, LOG_HEIGHT, N_
 #: steps at most, and so many of them for all spots together. A spot is done when its centre moves by less than this
 #: (px), or the step by less than this (sd²): the next would be several times smaller
 MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
-#: what is left of a spot that is cut off goes to its minimum by smaller steps, px
-DONE_CUT_PX = 2e-3
+#: what is left of a spot that is cut off goes to its minimum by smaller steps, px; more so if it is thick
+DONE_CUT_PX = 5e-4
 #: of a long spot, how flat it is tells one rod from two: its ln γ moves by less than this in the last step
 DONE_FLATNESS = 0.05
 #: range of ln β and ln γ: from tails heavier than a Gaussian's to nearly a box

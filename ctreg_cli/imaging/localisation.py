@@ -53,9 +53,15 @@ STEEP, STEEP_SD_PX, STEEP_POWER = 0.8, 0.002, 5.5
 #: the same of a spot that is cut off, where its edge falls by so much of the ceiling in a pixel: of such a
 #: spot only the sides are seen
 CUT, CUT_SD_PX, CUT_POWER = 1.5, 0.0042, 1.2
+#: of a spot that is cut off, and that the profile does not fit (a sharp kernel's undershoot), the variance that noise
+#: makes grows by this share of what the mean weighted square of its residuals exceeds 1 by
+MISFIT_SHARE = 0.6
 #: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
 #: variance is twice that of the linear law where it stands out by so many sd of the noise
 FAINT_SD = 5.0
+#: a smooth kernel's noise makes peaks of the height of its whole sd, not of what differs from pixel to pixel; but part
+#: of what seems to be such noise is structure, which hides no rod
+SMOOTH_NOISE_SHARE = 0.7
 #: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
@@ -74,7 +80,7 @@ class Centres:
     uv_px: FloatArray
     #: (k, 2, 2) px²
     covariance_px: FloatArray
-    #: (k,) sd of what differs from pixel to pixel about each blob, stored units
+    #: (k,) sd of the noise that a spot must stand out of, stored units
     noise: FloatArray
 
 
@@ -125,7 +131,8 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     if not found.all():
         uv = np.where(found[:, None], uv, blobs.centre)
         covariance = np.where(found[:, None, None], covariance, blobs.moments)
-    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=law.rough)
+    noise = np.maximum(law.rough, SMOOTH_NOISE_SHARE * law.smooth)
+    return Centres(uv_px=blobs.middles + uv, covariance_px=covariance, noise=noise)
 
 
 def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
@@ -243,11 +250,16 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
     if len(long):
         influence = long.turned_back(influence)
     rough, smooth, length = noise_field(fitted.residuals, fitted.quiet, radius)
+    response = responses(influence, radius, length)
     least = _of_pixels(fitted.parameters, long.mask, fitted.n_clipped > 0, fitted.ceiling)[:, None, None] * np.eye(2)
+    cut = np.flatnonzero(fitted.n_clipped)
+    if len(cut):
+        misfit = np.maximum((by_spot[cut, -1] ** 2).mean(axis=1) - 1.0, 0.0)
+        least[cut] += (MISFIT_SHARE * misfit * rough[cut] ** 2)[:, None, None] * response[1, cut]
     if len(long):
         least[long.index] += long.pair_covariance(fitted.parameters, by_spot, fitted.normal)
     return Law(
-        response=responses(influence, radius, length),
+        response=response,
         smooth=smooth,
         rough=rough,
         faint=1.0 + (FAINT_SD * rough / fitted.height) ** 3,

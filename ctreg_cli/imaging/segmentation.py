@@ -10,6 +10,7 @@ sorted out, the rest ranked → centres and covariances (:mod:`.localisation`).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -21,7 +22,16 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, joined, measure_blobs, measure_lone_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
 from ctreg_cli.imaging.maxima import local_maxima, smoothed
-from ctreg_cli.imaging.peaks import BLOCK_PX, COARSE_PX, Peaks, image_noise, large_regions, maxima_above, rate_peaks
+from ctreg_cli.imaging.peaks import (
+    BLOCK_PX,
+    COARSE_PX,
+    RING_RATIO,
+    Peaks,
+    image_noise,
+    large_regions,
+    maxima_above,
+    rate_peaks,
+)
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import RejectedSpot, Spots
 from ctreg_cli.imaging.window import UprightImage, grid
@@ -31,11 +41,11 @@ Polarity = Literal["bright", "dark", "auto"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentationOptions:
-    """Defaults suit CT and MR slices of any scanner; every field is an option of ``ctreg segment``."""
+    """Defaults suit CT and MR slices of any scanner; commands set the polarity, and diameters from their frame file."""
 
     #: whether rods are brighter or darker than what surrounds them; ``auto`` takes what stands out more
     polarity: Polarity = "bright"
-    #: (least, greatest) rod diameter, mm; sets the expected size where the slice has a scale
+    #: (least, greatest) rod diameter, mm; the greatest sets the expected size where the slice has a scale
     rod_diameter_mm: tuple[float, float] | None = None
     #: at most so many spots a slice, the best ones
     max_spots: int = 40
@@ -55,6 +65,9 @@ BRIGHTEST = 0.25
 WINDOW_RADII_PX = (8, 12, 18, 26)
 #: without a known rod diameter a spot is at most so thick: in mm, or where there is no scale as a share of the image
 MAX_WIDTH_MM, MAX_WIDTH_OF_IMAGE, LEAST_MAX_WIDTH_PX = 6.0, 0.02, 8.0
+#: but thicker by up to this factor if it stands out by this share of the best spot and fills this share of an ellipse:
+#: rods of one frame look alike, bones are fainter than the metal beside them, and plates and clamps have corners
+THICK_FACTOR, THICK_CONTRAST, THICK_FILL = 5 / 3, 0.5, 0.93
 #: blur and clipping make a spot look wider than its rod: by this factor and this many pixels
 BLOOM_FACTOR, BLOOM_PX = 1.5, 4.0
 #: the slab blurs over more than its nominal thickness
@@ -70,7 +83,7 @@ PEAKS_PER_SPOT = 6
 #: things are bright that lie above one of these shares of the range between the image's median and its brightest: in a
 #: body that does so itself, its bones do
 LARGE_SHARES = (0.25, 0.45)
-#: at most so many rejected candidates are reported
+#: at most so many rejected candidates are reported by their places; all are counted
 MAX_REJECTED = 100
 
 
@@ -123,30 +136,59 @@ def _find(slice_: Slice, options: SegmentationOptions, *, bright: bool) -> Spots
         pixels, heights = np.stack([columns, rows], axis=1), smooth[rows, columns].astype(np.float64)
         peaks = rate_peaks(image, pixels, heights, 0.5 * limits.width_px)
         rejections = _Rejections()
-        groups = _blobs_at(image, peaks.take(peaks.contrast > margin), limits, options, rejections)
-        spots = _spots_of(image, groups, options, rejections)
+        groups = _blobs_at(image, peaks.take(peaks.contrast > margin), limits.width_px, limits, options, rejections)
+        spots = _spots_of(image, groups, limits, options, rejections)
         needed = max(least, share * float(spots.contrast.max(initial=0.0)) / image.unit)
         if margin <= needed:
-            return _with_large_regions(spots, image, smooth, limits)
+            break
         margin = needed
+    boxes = _large_boxes(image, smooth, 0.5 * limits.width_px)
+    thick = _thick_blobs(image, smooth, boxes, spots, limits)
+    if thick:
+        spots = _spots_of(image, [*groups, *thick], limits, options, rejections)
+    wide = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) + COARSE_PX > limits.width_px
+    rejections.add(_middles_of_unseen(boxes[wide], spots, rejections), "too_large", first=True)
+    return rejections.of(spots)
 
 
-def _with_large_regions(spots: Spots, image: UprightImage, smooth: NDArray[Any], limits: _Limits) -> Spots:
-    """The same spots, and among the rejected what is bright and so large that it has no peak of its own."""
+def _large_boxes(image: UprightImage, smooth: NDArray[Any], least_px: float) -> FloatArray:
+    """Boxes (m, 4) = (u, v from, u, v to) about what is bright and so large that it may have no peak of its own."""
     sample = smooth[::COARSE_PX, ::COARSE_PX]
     sample = sample[np.isfinite(sample)]
     if not sample.size:
-        return spots
+        return np.empty((0, 4))
     common = float(np.median(sample))
     levels = common + np.array(LARGE_SHARES) * (image.ceiling - common)
-    boxes = np.vstack([large_regions(smooth, level, limits.width_px) for level in levels[::-1]])
-    seen = np.vstack([spots.uv_px, *([[r.u_px, r.v_px]] for r in spots.rejected)])
-    inside = np.all((seen >= boxes[:, None, :2]) & (seen <= boxes[:, None, 2:]), axis=2)
-    unseen = boxes[~np.any(inside, axis=1)]
-    rejections = _Rejections()
-    middles = np.unique(0.5 * (unseen[:, :2] + unseen[:, 2:]), axis=0)
-    rejections.add(middles, "too_large")
-    return replace(spots, rejected=(*rejections.spots, *spots.rejected))
+    return np.vstack([large_regions(smooth, level, least_px) for level in levels[::-1]])
+
+
+def _thick_blobs(
+    image: UprightImage, smooth: NDArray[Any], boxes: FloatArray, spots: Spots, limits: _Limits
+) -> list[Blobs]:
+    """Blobs in the middle of ``boxes`` that stand out no less than is asked of thick ones beside ``spots``."""
+    boxes = boxes[(boxes[:, 2:] - boxes[:, :2]).min(axis=1) <= limits.thick_px]
+    boxes = boxes[~_within(spots.uv_px, boxes).any(axis=1)]
+    pixels = np.unique((0.5 * (boxes[:, :2] + boxes[:, 2:])).astype(np.intp), axis=0)
+    if not len(pixels):
+        return []
+    heights = smooth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    peaks = rate_peaks(image, pixels, heights, 0.75 * limits.thick_px)
+    least = THICK_CONTRAST * float(spots.contrast.max(initial=0.0)) / image.unit
+    strong = (peaks.contrast >= least) & np.isfinite(peaks.half_width)
+    return _blobs(image, peaks.pixels[strong], limits, least, _Rejections())
+
+
+def _middles_of_unseen(boxes: FloatArray, spots: Spots, rejections: _Rejections) -> FloatArray:
+    """Middles (m, 2) of the ``boxes`` in which neither a spot nor a rejected candidate lies."""
+    seen = np.vstack([spots.uv_px, *([[r.u_px, r.v_px]] for r in rejections.spots)])
+    unseen = boxes[~_within(seen, boxes).any(axis=1)]
+    return np.unique(0.5 * (unseen[:, :2] + unseen[:, 2:]), axis=0)
+
+
+def _within(uv: FloatArray, boxes: FloatArray) -> BoolArray:
+    """Which points (k, 2) lie in which boxes (m, 4): (m, k)."""
+    inside: BoolArray = np.all((uv >= boxes[:, None, :2]) & (uv <= boxes[:, None, 2:]), axis=2)
+    return inside
 
 
 def _measure(
@@ -163,10 +205,11 @@ def _measure(
     groups = [lone] if len(lone) else []
     if not settled.all():
         peaks = _peaks_about(image, uv[~settled], radius[~settled], limits)
-        groups += _blobs_at(image, peaks.take(peaks.contrast > 0), limits, options, rejections)
-    spots = _spots_of(image, _merged(groups), options, rejections)
+        width_px = RING_RATIO * limits.thick_px  # how thick it is shows better in its blob than between two rings
+        groups += _blobs_at(image, peaks.take(peaks.contrast > 0), width_px, limits, options, rejections)
+    spots = _spots_of(image, _merged(groups), limits, options, rejections)
     near = (np.linalg.norm(spots.uv_px[:, None] - uv, axis=2) <= radius).any(axis=1)
-    return spots if near.all() else spots.take(near)
+    return rejections.of(spots if near.all() else spots.take(near))
 
 
 def _lone_blobs(image: UprightImage, uv: FloatArray, radius: FloatArray, limits: _Limits) -> tuple[Blobs, BoolArray]:
@@ -203,7 +246,7 @@ def _brightest_place(windows: FloatArray) -> IntArray:
 
 
 def _peaks_about(image: UprightImage, uv: FloatArray, radius: FloatArray, limits: _Limits) -> Peaks:
-    """All peaks near predictions."""
+    """All peaks near predictions; the prediction itself where the window has none: it may lie within a flat top."""
     reach = int(np.ceil(radius.max())) + 2
     middles = np.rint(uv).astype(np.intp)
     windows = smoothed(image.windows(middles, reach))
@@ -212,7 +255,10 @@ def _peaks_about(image: UprightImage, uv: FloatArray, radius: FloatArray, limits
     heights = windows[which, rows, columns]
     looked_at = ((pixels - uv[which]) ** 2).sum(axis=1) <= (radius[which] + 1.0) ** 2
     looked_at &= heights > np.median(windows, axis=(1, 2))[which]
-    return rate_peaks(image, pixels[looked_at], heights[looked_at], 0.5 * limits.width_px)
+    bare = ~np.isin(np.arange(len(uv)), which[looked_at])
+    pixels = np.vstack([pixels[looked_at], middles[bare]])
+    heights = np.concatenate([heights[looked_at], windows[bare, reach, reach]])
+    return rate_peaks(image, pixels, heights, 0.5 * limits.thick_px)
 
 
 def _merged(groups: Sequence[Blobs]) -> list[Blobs]:
@@ -227,7 +273,11 @@ class _Limits:
     """Greatest thickness and length of a spot, px."""
 
     width_px: float
+    #: of spots no thicker than that
     length_px: float
+    #: greatest thickness of what stands out no less than the best spots
+    thick_px: float
+    max_tilt_deg: float
 
     @classmethod
     def of(cls, slice_: Slice, options: SegmentationOptions) -> _Limits:
@@ -240,11 +290,22 @@ class _Limits:
         else:
             width = BLOOM_FACTOR * options.rod_diameter_mm[1] * px_per_mm + BLOOM_PX
         width = max(width, LEAST_MAX_WIDTH_PX)
+        known = px_per_mm is not None and options.rod_diameter_mm is not None
         length = MAX_ELONGATION * width
         if thickness is not None and px_per_mm is not None:
             tilt = np.radians(options.max_tilt_deg)
             length = float(width / np.cos(tilt) + SLAB_FACTOR * thickness * px_per_mm * np.tan(tilt))
-        return cls(width_px=width, length_px=length)
+        return cls(
+            width_px=width,
+            length_px=length,
+            thick_px=width if known else THICK_FACTOR * width,
+            max_tilt_deg=options.max_tilt_deg,
+        )
+
+    def lengths_px(self, width_px: FloatArray) -> FloatArray:
+        """Greatest lengths (k,) of spots so thick (k,): tilt lengthens what is thicker the more."""
+        beyond = np.maximum(width_px - self.width_px, 0.0)
+        return np.asarray(self.length_px + beyond / np.cos(np.radians(self.max_tilt_deg)))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -252,23 +313,42 @@ class _Rejections:
     """What was left out so far."""
 
     spots: list[RejectedSpot] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
 
-    def add(self, uv: FloatArray | IntArray, reason: str) -> None:
-        room = MAX_REJECTED - len(self.spots)
-        self.spots += [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:room]]
+    def add(self, uv: FloatArray | IntArray, reason: str, *, first: bool = False) -> None:
+        """Count candidates (k, 2), and list them, after all others or before them, as far as there is room."""
+        if len(uv):
+            self.counts[reason] += len(uv)
+            new = [RejectedSpot(u_px=float(u), v_px=float(v), reason=reason) for u, v in uv[:MAX_REJECTED]]
+            self.spots = [*new, *self.spots][:MAX_REJECTED] if first else [*self.spots, *new][:MAX_REJECTED]
+
+    def of(self, spots: Spots) -> Spots:
+        """The spots with these rejections instead of their own, but for what is the inside of a spot."""
+        rejected, counts = self.spots, self.counts.copy()
+        if len(spots) and rejected:
+            uv = np.array([[r.u_px, r.v_px] for r in rejected])
+            inside = (np.linalg.norm(uv[:, None] - spots.uv_px, axis=2) < 0.5 * spots.minor_px).any(axis=1)
+            counts -= Counter(r.reason for r, is_in in zip(rejected, inside, strict=True) if is_in)
+            rejected = [r for r, is_in in zip(rejected, inside, strict=True) if not is_in]
+        return replace(spots, rejected=tuple(rejected), n_rejected=dict(counts))
 
 
 def _blobs_at(
-    image: UprightImage, peaks: Peaks, limits: _Limits, options: SegmentationOptions, rejections: _Rejections
+    image: UprightImage,
+    peaks: Peaks,
+    width_px: float,
+    limits: _Limits,
+    options: SegmentationOptions,
+    rejections: _Rejections,
 ) -> list[Blobs]:
-    """Blobs at ``peaks`` that could be spots, in groups of one size of window."""
+    """Blobs at ``peaks`` no wider than ``width_px`` that could be spots, in groups of one size of window."""
     peaks = peaks.take(np.argsort(-peaks.contrast, kind="stable"))
-    large = peaks.half_width > 0.5 * limits.width_px + 1.0
+    large = peaks.half_width > 0.5 * width_px + 1.0
     rejections.add(_one_a_block(peaks.pixels[large]), "too_large")
     peaks = peaks.take(~large)
     least = SMOOTHING_LOSS * options.min_relative_contrast * peaks.contrast.max(initial=0.0)
     faint = (peaks.contrast < least) | (np.arange(len(peaks.pixels)) >= PEAKS_PER_SPOT * options.max_spots)
-    groups = _blobs(image, peaks.pixels[~faint], limits, rejections)
+    groups = _blobs(image, peaks.pixels[~faint], limits, least, rejections)
     rejections.add(peaks.pixels[faint], "low_contrast")
     return groups
 
@@ -282,51 +362,70 @@ def _one_a_block(pixels: IntArray) -> IntArray:
 
 
 def _spots_of(
-    image: UprightImage, groups: Sequence[Blobs], options: SegmentationOptions, rejections: _Rejections
+    image: UprightImage,
+    groups: Sequence[Blobs],
+    limits: _Limits,
+    options: SegmentationOptions,
+    rejections: _Rejections,
 ) -> Spots:
     """The best blobs, fitted and ranked."""
     if not groups:
-        return Spots(uv_px=_EMPTY.uv_px, covariance_px=_EMPTY.covariance_px, rejected=tuple(rejections.spots))
-    chosen = _choose(groups, options, rejections)
+        return _EMPTY
+    chosen = _choose(groups, limits, options, rejections)
     ends = np.cumsum([len(group) for group in groups])[:-1]
     parts = [group.take(part) for group, part in zip(groups, np.split(chosen, ends), strict=True) if part.any()]
     return _as_spots(parts, [fit_centres(part, image.ceiling) for part in parts], image.unit, options, rejections)
 
 
-def _blobs(image: UprightImage, pending: IntArray, limits: _Limits, rejections: _Rejections) -> list[Blobs]:
-    """Blobs that could be spots, grouped by size of window: the smallest that shows background about them."""
+def _blobs(
+    image: UprightImage, pending: IntArray, limits: _Limits, least: float, rejections: _Rejections
+) -> list[Blobs]:
+    """Blobs that could be spots, grouped by size of window: the smallest that shows background about them.
+
+    Where nothing stands out by ``least``, the window may lie within something wider than itself: a larger one is tried.
+    """
     groups, previous = [], 0
+    faint = np.zeros(len(pending), dtype=bool)
+    longest = max(limits.length_px, limits.thick_px)
     for radius in WINDOW_RADII_PX:
-        if not len(pending) or previous > 0.5 * limits.length_px + BACKGROUND_PX:
+        if not len(pending) or previous > 0.5 * longest + BACKGROUND_PX:
             break
-        previous = radius
         blobs = measure_blobs(image, pending, radius)
-        cut_off = blobs.cut_off
-        pending = pending[cut_off]
-        blobs = blobs.take(~cut_off)
-        blobs = blobs.take(np.sort(np.unique(blobs.middles, axis=0, return_index=True)[1]))  # peaks of the same blob
         major, minor, _ = blobs.axes
-        for bad, reason in (
-            (blobs.height <= 0, "low_contrast"),
-            (minor > limits.width_px, "too_large"),
-            (major > limits.length_px, "too_elongated"),
+        now_faint = (blobs.height <= 0) | (blobs.height < least)
+        beside = faint & ~now_faint & (minor <= previous)  # something else stands out of the larger window's background
+        rejections.add(blobs.uv_px[beside], "low_contrast")
+        too_small = ~beside & (blobs.cut_off | now_faint)
+        ragged = blobs.area < THICK_FILL * 0.25 * np.pi * major * minor
+        good = ~beside & ~too_small
+        for is_so, reason in (
+            ((minor > limits.thick_px) | ((minor > limits.width_px) & ragged), "too_large"),
+            (major > limits.lengths_px(minor), "too_elongated"),
             (blobs.at_border, "at_border"),
         ):
-            rejections.add(blobs.uv_px[bad], reason)
-        good = (blobs.height > 0) & (minor <= limits.width_px) & (major <= limits.length_px) & ~blobs.at_border
+            rejections.add(np.unique(blobs.uv_px[good & is_so], axis=0), reason)
+            good &= ~is_so
         if good.any():
-            groups.append(blobs.take(good))
-    rejections.add(pending, "too_large")
+            found = blobs.take(good)  # several peaks may lead to the same one
+            groups.append(found.take(np.sort(np.unique(found.middles, axis=0, return_index=True)[1])))
+        pending, faint, previous = pending[too_small], now_faint[too_small], radius
+    rejections.add(pending[faint], "low_contrast")
+    rejections.add(pending[~faint], "too_large")
     return groups
 
 
-def _choose(groups: Sequence[Blobs], options: SegmentationOptions, rejections: _Rejections) -> BoolArray:
+def _choose(
+    groups: Sequence[Blobs], limits: _Limits, options: SegmentationOptions, rejections: _Rejections
+) -> BoolArray:
     """Which blobs of all groups (in their order) become spots: the best, each blob once."""
     uv = np.concatenate([group.uv_px for group in groups])
     height = np.concatenate([group.height for group in groups])
     major, minor, _ = _axes(groups)
+    thick = (minor > limits.width_px) & (height < THICK_CONTRAST * height.max())
     order = np.argsort(-_score(height, major, minor), kind="stable")
     order = order[_apart(uv[order], minor[order])]
+    rejections.add(uv[order[thick[order]]], "too_large")
+    order = order[~thick[order]]
     faint = height[order] < options.min_relative_contrast * height[order[0]]
     beyond = ~faint & (np.cumsum(~faint) > options.max_spots)
     rejections.add(uv[order[faint]], "low_contrast")
@@ -379,7 +478,6 @@ def _as_spots(
         major_px=major[keep],
         minor_px=minor[keep],
         angle_rad=angle[keep],
-        rejected=tuple(rejections.spots),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,6 +49,8 @@ class Spots:
     #: True where the sd was not measured but assumed (``DEFAULT_SPOT_SD_PX`` or ``--spot-sd``)
     sd_assumed: bool = False
     rejected: tuple[RejectedSpot, ...] = ()
+    #: reason → how many were rejected; those of ``rejected`` where nothing else is said
+    n_rejected: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -57,6 +61,8 @@ class Spots:
         for name in _ARRAYS[2:]:
             values = getattr(self, name)
             set_(self, name, frozen(values if len(values) else np.full(m, np.nan), (m,)))
+        if self.rejected and not self.n_rejected:
+            set_(self, "n_rejected", dict(Counter(spot.reason for spot in self.rejected)))
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -70,12 +76,16 @@ class Spots:
     def take(self, which: BoolArray | IntArray) -> Spots:
         """Some of the spots; the rejected candidates stay."""
         arrays = {name: getattr(self, name)[which] for name in _ARRAYS}
-        return Spots(**arrays, sd_assumed=self.sd_assumed, rejected=self.rejected)
+        return Spots(**arrays, sd_assumed=self.sd_assumed, rejected=self.rejected, n_rejected=self.n_rejected)
 
     def joined(self, other: Spots) -> Spots:
         """These spots and others of the same slice, all measured."""
         arrays: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _ARRAYS}
-        return Spots(**arrays, rejected=(*self.rejected, *other.rejected))
+        return Spots(
+            **arrays,
+            rejected=(*self.rejected, *other.rejected),
+            n_rejected=Counter(self.n_rejected) + Counter(other.n_rejected),
+        )
 
     @property
     def sd_px(self) -> FloatArray:

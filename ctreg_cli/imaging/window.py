@@ -1,5 +1,8 @@
 """Square windows of a slice, as the fits want them: stored units, spots upright, padding as NaN.
 
+Stored units are whole numbers, and are fitted as such. Pixels of floating point, whose range may be anything, are
+stretched to the range of 16 bits first.
+
 Nothing here touches the whole image except one search for its largest value: the tracking path looks at a few hundred
 pixels of a quarter of a million.
 """
@@ -16,13 +19,16 @@ from numpy.typing import NDArray
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.imaging.slice import Slice
 
+#: steps over the range of an image of floating point
+FLOAT_STEPS = 65536.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class UprightImage:
     """A slice seen so that its spots are bright: stored values times ``sign``; what is not image is NaN."""
 
     source: Slice
-    #: +1 when spots are brighter than what surrounds them, −1 when darker
+    #: +1 when spots are brighter than what surrounds them, −1 when darker; of floating-point pixels times a stretch
     sign: float
     #: the largest upright value of the image; pixels that hold it may be cut off (3071 HU, 255 in a PNG)
     ceiling: float
@@ -30,13 +36,15 @@ class UprightImage:
     @classmethod
     def of(cls, slice_: Slice, *, bright: bool) -> UprightImage:
         """View ``slice_`` with spots upright; a negative rescale slope turns the stored values over once more."""
-        sign = float(np.sign(slice_.slope)) * (1.0 if bright else -1.0)
+        sign = (-1.0 if slice_.slope < 0 else 1.0) * (1.0 if bright else -1.0)
         stored = slice_.stored
         counted = np.issubdtype(stored.dtype, np.integer)
         extreme = (stored.max() if sign > 0 else stored.min()) if stored.size and counted else np.nan
         if not counted or (slice_.padding is not None and slice_.padding[0] <= extreme <= slice_.padding[1]):
             valid = stored[np.isfinite(stored) & ~slice_.is_padding(stored)]
             extreme = (valid.max() if sign > 0 else valid.min()) if valid.size else np.nan
+            if not counted and valid.size:
+                sign *= _stretch(float(valid.min()), float(valid.max()))
         ceiling = -np.inf if np.isnan(extreme) else float(extreme) * sign
         return cls(source=slice_, sign=sign, ceiling=ceiling)
 
@@ -48,16 +56,19 @@ class UprightImage:
 
     @property
     def unit(self) -> float:
-        """The image's own units (HU) in one stored unit, always positive."""
-        return abs(self.source.slope)
+        """The image's own units (HU) in one upright unit, always positive."""
+        return abs(self.source.slope / self.sign)
 
     def dense(self) -> NDArray[Any]:
         """The whole image, float32 where that holds the stored values exactly; NaN outside the image."""
         stored = self.source.stored
         exact = np.issubdtype(stored.dtype, np.integer) and stored.dtype.itemsize <= 2
         image = stored.astype(np.float32 if exact else np.float64)
-        if self.sign < 0:
+        if self.sign == -1.0:
             np.negative(image, out=image)
+        elif self.sign != 1.0:
+            np.multiply(image, self.sign, out=image)
+            image[~np.isfinite(image)] = np.nan
         if self.source.padding is not None:
             image[self.source.is_padding(stored)] = np.nan
         return image
@@ -78,6 +89,8 @@ class UprightImage:
             flat[outside] = 0
         stored = self.source.stored.ravel().take(flat)  # one flat index costs half of a pair
         values: FloatArray = stored * self.sign
+        if abs(self.sign) != 1.0:
+            values[~np.isfinite(values)] = np.nan
         padding = self.source.padding
         if padding is not None and stored.size and padding[1] >= stored.min() and padding[0] <= stored.max():
             values[self.source.is_padding(stored)] = np.nan
@@ -91,6 +104,12 @@ class UprightImage:
         rows = centres[:, 1, None, None] + offset[:, None]
         columns = centres[:, 0, None, None] + offset[None, :]
         return self.at(rows, columns)
+
+
+def _stretch(low: float, high: float) -> float:
+    """Factor that takes a range to that of 16 bits; 1 where there is no range."""
+    extent = high - low
+    return FLOAT_STEPS / extent if 0.0 < extent < np.inf else 1.0
 
 
 @cache

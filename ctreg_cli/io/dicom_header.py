@@ -57,6 +57,8 @@ PREAMBLE_BYTES = 128
 MAGIC = b"DICM"
 #: a deflated data set is inflated this far to find its header: no small file may fill the memory
 MAX_INFLATED_HEADER_BYTES = 16 * 2**20
+#: the longest headers have some thousand elements at the top level; a file of nothing else is not walked through
+MAX_ELEMENTS = 2**17
 
 _DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _INTEGER = re.compile(rb"[+-]?\d{1,12}")
@@ -365,8 +367,13 @@ def _guess_encoding(file: BinaryIO) -> tuple[bool, bool]:
 def _walk(file: BinaryIO, implicit: bool, little: bool) -> tuple[dict[int, Any], PixelElement | None]:
     """The wanted elements up to the pixels, and where the pixels are."""
     found: list[PixelElement] = []
+    n_elements = 0
 
     def at_pixels(tag: int, vr: str | None, length: int) -> bool:
+        nonlocal n_elements
+        n_elements += 1
+        if n_elements > MAX_ELEMENTS:
+            raise problem("PixelData", f"does not come within the first {MAX_ELEMENTS} elements")
         if tag not in _PIXEL_TAGS:
             return False
         length_or_none = None if length == 0xFFFFFFFF else length

@@ -278,7 +278,7 @@ def _draw_legend(
         (len(labels), "labelled", MATCHED),
         (len(spots) - len(labels), "other spots" if labels else "spots", UNMATCHED),
         (n_missing, "missing", MISSING),
-        (len(spots.rejected) if show_rejected else 0, "rejected", REJECTED),
+        (sum(spots.n_rejected.values()) if show_rejected else 0, "rejected", REJECTED),
     ]
     x = float(MARGIN)
     for count, word, colour in counts:

@@ -12,10 +12,15 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from typer.testing import CliRunner
 
+from ctreg_cli import pipeline
+from ctreg_cli.cli.app import app
 from ctreg_cli.cli.run import ScaleChoice
 from ctreg_cli.geometry.pose import rotation_angle
-from ctreg_cli.imaging.slice import SliceInfo
+from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, find_spots
+from ctreg_cli.imaging.slice import Slice, SliceInfo
+from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.results import PoseRow, read_results
 from ctreg_cli.io.spots_file import read_spots
 from ctreg_cli.scale import Scale
@@ -45,6 +50,24 @@ def test_segment_finds_every_rod(two_slices: Path, truth: dict[str, dict[str, An
     for table, document in zip(read_spots(tmp_path / "s.csv"), read_spots(tmp_path / "s.json"), strict=True):
         np.testing.assert_array_equal(table.spots.uv_px, document.spots.uv_px)
         assert document.info.T_patient_slice is not None
+
+
+@pytest.mark.parametrize("command", ["calibrate", "pose", "track", "model refine"])
+def test_commands_that_know_the_frame_expect_its_rods(
+    command: str, two_slices: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All the sample frame's rods are 1 mm thick."""
+    expected = set()
+
+    def find(slice_: Slice, options: SegmentationOptions = DEFAULT_OPTIONS) -> Spots:
+        expected.add(options.rod_diameter_mm)
+        return find_spots(slice_, options)
+
+    monkeypatch.setattr(pipeline, "find_spots", find)
+    out = tmp_path / ("out.csv" if command in ("pose", "track") else "out.yaml")
+    # two slices do not determine the rods: what becomes of them is another test's business
+    CliRunner().invoke(app, [*command.split(), str(two_slices), "-m", FRAME, "-o", str(out)])
+    assert expected == {(1.0, 1.0)}
 
 
 def test_pose_is_the_true_pose(two_slices: Path, truth: dict[str, dict[str, Any]], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, find_spots, measure_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo
@@ -97,6 +98,27 @@ def test_the_same_picture_in_other_numbers_gives_the_same_centres(image: np.ndar
     np.testing.assert_allclose(centres(as_slice(image / 16 + 30, dtype=np.uint8)), expected, atol=0.03)
 
 
+@pytest.mark.parametrize(("factor", "offset"), [(1e-6, 0.0), (1 / 4095, 0.25), (1e6, -3e8), (1e-200, 0.0)])
+def test_floating_point_pixels_may_have_any_range(image: np.ndarray, factor: float, offset: float) -> None:
+    expected = find_spots(as_slice(np.rint(image)))
+    spots = find_spots(as_slice(np.rint(image) * factor + offset, dtype=np.float64))
+    assert len(spots) == 3
+    np.testing.assert_allclose(spots.uv_px, expected.uv_px, atol=1e-3)
+    np.testing.assert_allclose(spots.contrast, expected.contrast * factor, rtol=1e-6)
+    np.testing.assert_allclose(spots.covariance_px, expected.covariance_px, rtol=0.05)
+    measured = measure_spots(as_slice(np.rint(image) * factor + offset, dtype=np.float64), UV, 4.0)
+    assert np.linalg.norm(measured.uv_px[:, None] - expected.uv_px, axis=2).min(axis=0).max() < 1e-3
+
+
+@pytest.mark.parametrize("nothing", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_no_numbers_are_no_image(image: np.ndarray, nothing: float) -> None:
+    values = np.rint(image)
+    values[:20] = values[20:25, 20:24] = nothing
+    spots = find_spots(as_slice(values, dtype=np.float64))
+    np.testing.assert_allclose(spots.uv_px, find_spots(as_slice(image)).uv_px, atol=1e-3)
+    assert np.isfinite(spots.covariance_px).all()
+
+
 def test_contrast_is_in_the_units_of_the_image(image: np.ndarray) -> None:
     hounsfield = find_spots(as_slice(image + 1024, intercept=-1024.0)).contrast
     doubled = find_spots(as_slice(image + 1024, slope=2.0)).contrast
@@ -181,7 +203,7 @@ def test_what_is_no_rod_is_left_out_with_the_reason(values: object, reason: str)
     assert reason in {r.reason for r in spots.rejected}
 
 
-@pytest.mark.parametrize("radius_px", [10, 20, 60])
+@pytest.mark.parametrize("radius_px", [13, 20, 60])
 def test_what_is_far_too_large_is_named_once(radius_px: int) -> None:
     row, column = np.mgrid[:160, :160]
     body = 2000.0 * (np.hypot(row - 80, column - 76) < radius_px) + np.random.default_rng(2).normal(
@@ -203,6 +225,64 @@ def test_thick_rods_with_flat_tops_are_all_found_and_well(diameter_mm: float, mm
     spots = find_spots(as_slice(np.minimum(image + noise, 3071), mm_per_px=mm_per_px))
     distance = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).min(axis=0)
     assert distance.max() < 0.03
+
+
+@pytest.mark.parametrize("ceiling", [np.inf, 3071.0])
+@pytest.mark.parametrize(("diameter_mm", "mm_per_px"), [(4.0, 0.3), (8.0, 0.3), (5.5, 0.5), (8.0, 0.5), (7.0, 0.8)])
+def test_rods_thicker_than_usual_are_found_if_nothing_stands_out_more(
+    diameter_mm: float, mm_per_px: float, ceiling: float
+) -> None:
+    """No diameter is given; the smallest windows lie within such a rod, and show nothing."""
+    rod = {"blur_mm": 0.4, "diameter_mm": diameter_mm, "mm_per_px": mm_per_px, "contrast": 5000.0}
+    image, uv = render_grid(np.random.default_rng(6), 3, int(34 + 8 / mm_per_px), **rod)
+    noisy = np.minimum(image + np.random.default_rng(7).normal(0.0, 10.0, image.shape), ceiling)
+    slice_ = as_slice(noisy, mm_per_px=mm_per_px)
+    spots = find_spots(slice_)
+    assert len(spots) == len(uv)
+    assert not spots.rejected
+    assert np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).min(axis=0).max() < 0.03
+    measured = measure_spots(slice_, spots.uv_px + np.random.default_rng(8).uniform(-2, 2, spots.uv_px.shape), 5.0)
+    nearest = np.linalg.norm(measured.uv_px[:, None] - spots.uv_px, axis=2).argmin(axis=0)
+    assert (np.abs(measured.uv_px[nearest] - spots.uv_px) < spots.sd_px).all()  # windows may differ by a pixel
+
+
+def test_what_is_thick_and_fainter_than_the_rods_is_left_out(image: np.ndarray) -> None:
+    """As bones are beside metal; where the rods' diameter is known it is left out however strong it is."""
+    values = image + render_rod(SHAPE, (60.0, 100.0), diameter_mm=8.0, contrast=600.0)
+    spots = find_spots(as_slice(values))
+    np.testing.assert_allclose(spots.uv_px[np.argsort(spots.uv_px[:, 0])], UV, atol=0.05)
+    assert {r.reason for r in spots.rejected} == {"too_large"}
+    strong = as_slice(image + render_rod(SHAPE, (60.0, 100.0), diameter_mm=8.0, contrast=3000.0))
+    assert len(find_spots(strong)) == 4
+    assert len(find_spots(strong, SegmentationOptions(rod_diameter_mm=(1.0, 2.0)))) == 3
+
+
+@pytest.mark.parametrize("blur_px", [0.7, 1.0, 1.5])
+def test_a_smooth_kernel_s_noise_makes_few_spots_and_hides_no_rod(blur_px: float) -> None:
+    """CT fluoroscopy: neighbours' noise goes together, and its peaks look like faint spots."""
+    n_false = []
+    for seed in range(5):
+        noise = gaussian_filter(np.random.default_rng(seed).normal(0.0, 1.0, (256, 256)), blur_px)
+        rods = sum(render_rod((256, 256), (3 * u / 2, 2 * v)) for u, v in UV)
+        spots = find_spots(as_slice(rods + 80.0 * noise / noise.std()))
+        error = np.linalg.norm(spots.uv_px[:, None] - UV * (1.5, 2.0), axis=2)
+        assert (error.argmin(axis=0) < 3).all()  # the rods come first
+        assert error.min(axis=0).max() < 1.0
+        n_false.append(len(spots) - 3)
+    assert np.mean(n_false) < 0.5 * (DEFAULT_OPTIONS.max_spots - 3)  # judged pixel by pixel they fill all places
+
+
+def test_all_that_is_left_out_is_counted_even_where_not_all_is_listed() -> None:
+    noise = gaussian_filter(np.random.default_rng(9).normal(0.0, 1.0, (400, 400)), 1.5)
+    spots = find_spots(as_slice(1000.0 + 200.0 * noise / noise.std()))
+    assert sum(spots.n_rejected.values()) > len(spots.rejected) > 80
+    assert set(spots.n_rejected) >= {r.reason for r in spots.rejected}
+    row, column = np.mgrid[:400, :400]
+    body = np.where(np.hypot(row - 200, column - 190) < 40, 3071.0, 1000.0 + 200.0 * noise / noise.std())
+    large = find_spots(as_slice(body)).rejected
+    assert min(np.hypot(r.u_px - 190, r.v_px - 200) for r in large) < 4.0  # what one sees first is listed first
+    few = find_spots(as_slice(render_rod((96, 96), (1.3, 64.0))))
+    assert few.n_rejected == {"at_border": 1}
 
 
 def test_a_bone_within_a_body_is_named_too() -> None:

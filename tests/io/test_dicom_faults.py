@@ -102,6 +102,21 @@ def test_an_element_that_claims_gigabytes(tmp_path: Path) -> None:
     assert "Pixel Data (7FE0,0010)" in problem_of(tmp_path, GOOD[:at] + huge + GOOD[at:])
 
 
+@pytest.mark.parametrize("deflated", [False, True])
+def test_millions_of_empty_elements_are_not_walked_through(tmp_path: Path, deflated: bool) -> None:
+    """Eight bytes each: a file of a few hundred megabytes, or a deflated one of a few kilobytes, would take minutes."""
+    empty = b"\x09\x00\x10\x10LO\0\0" * 1_500_000
+    if deflated:
+        raw = dicom_bytes(ct_slice(), DeflatedExplicitVRLittleEndian)
+        deflater = zlib.compressobj(9, wbits=-15)
+        start = 132 + 12 + struct.unpack("<I", raw[140:144])[0]
+        bomb = raw[:start] + deflater.compress(empty) + deflater.flush()
+    else:
+        at = GOOD.index(b"\x18\x00\x50\x00")
+        bomb = GOOD[:at] + empty + GOOD[at:]
+    assert "does not come within the first" in problem_of(tmp_path, bomb)
+
+
 def test_a_deflated_bomb(tmp_path: Path) -> None:
     raw = dicom_bytes(ct_slice(), DeflatedExplicitVRLittleEndian)
     meta = raw[: 132 + 12 + struct.unpack("<I", raw[140:144])[0]]
