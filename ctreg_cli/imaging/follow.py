@@ -87,6 +87,7 @@ def _last_step() -> FloatArray:
 
 
 _PRIOR_MATRIX, _LAST_STEP = np.diag(_prior()), _last_step()
+_IS_HEIGHT = np.arange(N_PARAMETERS)[:, None] == LOG_HEIGHT
 
 
 class Follower:
@@ -183,7 +184,7 @@ class Follower:
         beyond = off + radius > RADIUS_PX
         if any(beyond.tolist()):  # the windows do not show all that was to be looked at
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
-            good[beyond] &= windows.nothing_else(centre[beyond], uv[beyond], radius[beyond], level[beyond])
+            good &= ~beyond | windows.nothing_else(centre, uv, radius, level, good)
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
@@ -400,7 +401,8 @@ def _stepped(
     n_clipped = (clipped & region.own).sum(axis=1)
     long = known.long if len(known.long) else None
     along, across = known.coordinates
-    cut_off = clipped if any(n_clipped.tolist()) else None
+    cut = n_clipped > 0
+    cut_off = clipped if any(cut.tolist()) else None
     rows = Rows(along, across, values, cut_off, root_weights, None if long is None else long.mask)
     parameters = known.parameters.copy()
     parameters[CENTRE] = brightest if long is None else long.turned(brightest)
@@ -412,7 +414,8 @@ def _stepped(
         gradient = products[:, -1, :-1]
         gradient[:, FLATNESS] -= known.flatness_prior * (parameters[FLATNESS] - known.flatness)
         shift, step = _solved(normal, gradient)
-        small = (np.abs(step) < _LAST_STEP).all(axis=0)
+        # where a spot is cut off, its height may be anything, and moves nothing else
+        small = ((np.abs(step) < _LAST_STEP) | (_IS_HEIGHT & cut)).all(axis=0)
         parameters = moved(parameters, step)
         if not n_left or small.all():
             break
@@ -503,21 +506,51 @@ class _Windows(NamedTuple):
             good &= ~self._is_padding(values).any(axis=1)
         return middles, values, (centre - middles).T, good
 
-    def nothing_else(self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray) -> BoolArray:
-        """Whether nothing within ``radius`` (k,) of ``uv`` (k, 2) is above a ``level`` (k,) but the spots themselves.
+    def nothing_else(
+        self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray, good: BoolArray
+    ) -> BoolArray:
+        """Whether no peak within ``radius`` (k,) of ``uv`` (k, 2) is above a ``level`` (k,) but the spots themselves.
 
-        Those are what lies in the windows about their ``centre`` (k, 2), which have been looked at.
+        Those are what lies in the windows about the ``centre`` (k, 2) of each ``good`` (k,) one, which have been looked
+        at; about ``uv`` of the others all will be measured in full. A streak that only rises towards something farther
+        off has no peak.
         """
         reach = math.ceil(float(radius.max()))
         middles = np.rint(uv)
         values = self._at(middles, reach)
-        u, v = (axis.ravel()[disc(reach)] for axis in grid(reach))
-        from_uv, from_centre = uv - middles, centre - middles
-        looked_at = (u - from_uv[:, :1]) ** 2 + (v - from_uv[:, 1:]) ** 2 <= (radius * radius)[:, None]
-        looked_at &= (u - from_centre[:, :1]) ** 2 + (v - from_centre[:, 1:]) ** 2 > (RADIUS_PX - 1.0) ** 2
+        bright = values > level[:, None]
         if self._may_be_padding(values):
-            looked_at &= ~self._is_padding(values)
-        return self._inside(middles, reach) & ~(looked_at & (values > level[:, None])).any(axis=1)
+            bright &= ~self._is_padding(values)
+        spot, pixel = np.nonzero(bright)
+        u, v = (axis.ravel()[disc(reach)] for axis in grid(reach))
+        at = middles[spot] + np.stack([u[pixel], v[pixel]], axis=1)
+        wanted = _length(at - uv[spot]) <= radius[spot]
+        spot, at = spot[wanted], at[wanted]
+        places, reaches = np.where(good[:, None], centre, uv), np.where(good, RADIUS_PX - 1.0, radius)
+        unseen = (_length(at[:, None] - places) > reaches).all(axis=1)
+        spot, at = spot[unseen], at[unseen].astype(np.intp)
+        clear = self._inside(middles, reach + 2)
+        if len(spot):
+            clear[spot[self._has_peak(at)]] = False
+        return clear
+
+    def _has_peak(self, pixels: IntArray) -> BoolArray:
+        """Whether (m,) one of the nine pixels about each of ``pixels`` (m, 2) is brighter than its own neighbours.
+
+        Means of nine pixels are compared, so that noise does not make peaks of its own. Next to padding all is a peak.
+        """
+        rows, columns = self.shape
+        u, v = pixels.T
+        inside = (np.minimum(u, v) >= 3) & (u < columns - 3) & (v < rows - 3)
+        around = np.arange(-3, 4)
+        at = (v * columns + u)[:, None, None] + around[:, None] * columns + around
+        values = self.sign * self.stored.take(at, mode="clip").astype(np.float64)
+        means = np.lib.stride_tricks.sliding_window_view(values, (3, 3), axis=(1, 2)).mean(axis=(3, 4))
+        greatest = np.lib.stride_tricks.sliding_window_view(means, (3, 3), axis=(1, 2)).max(axis=(3, 4))
+        peak = (means[:, 1:-1, 1:-1] >= greatest).any(axis=(1, 2))
+        if self._may_be_padding(values):
+            peak |= self._is_padding(values).any(axis=(1, 2))
+        return np.asarray(peak | ~inside)
 
     def _inside(self, middles: FloatArray, radius: int) -> BoolArray:
         """Which (k,) windows about ``middles`` (k, 2) lie in the image."""

@@ -205,6 +205,35 @@ def test_a_spot_beyond_the_window_but_within_the_radius_is_not_overlooked(monkey
         assert len(counts) == n - 1
 
 
+def test_a_neighbour_that_is_followed_itself_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But a spot between two, beyond the windows of both, is not overlooked because each leaves it to the other."""
+    rng, rods, wide = np.random.default_rng(11), np.array([0, 1]), np.array([14.0, 14.0])
+    both = UV + np.array([[-9.0, 0.0], [11.0, 2.0]])
+    rod, third = (render_rod(SHAPE, place, **ROD) for place in (tuple(both[1]), (39.3, 35.6)))
+    follower = Follower()
+    for _ in range(2):
+        assert len(follower.measure(one(rng, both[0], rod), rods, both + 0.4, wide)) == 2
+    counts = in_full(monkeypatch)
+    spots = follower.measure(one(rng, both[0], rod), rods, both + 0.4, wide)
+    assert not counts
+    np.testing.assert_allclose(matched(spots, both).uv_px, both, atol=0.1)
+    assert len(follower.measure(one(rng, both[0], rod + third), rods, both + 0.4, wide)) == 3
+    assert counts == [2]
+
+
+def test_what_only_rises_towards_something_farther_off_is_no_spot(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, wide = np.random.default_rng(12), np.array([14.0])
+    from_rod = np.mgrid[: SHAPE[0], : SHAPE[1]][1] - UV[0, 0]
+    follower = Follower()
+    for _ in range(2):
+        assert len(follower.measure(one(rng), ONE, UV, wide)) == 1
+    counts = in_full(monkeypatch)
+    for off, is_followed in ((18.0, True), (11.0, False)):
+        ridge = 1500.0 * np.exp(-0.5 * ((from_rod - off) / 2.5) ** 2)
+        assert len(follower.measure(one(rng, more=ridge), ONE, UV, wide)) == 1
+        assert (not counts) == is_followed
+
+
 @pytest.mark.parametrize("uv", [at(6.2, 35.0), at(75.9, 66.1), at(38.0, 2.0)])
 def test_at_the_border_and_in_padding_spots_are_measured_in_full(uv: np.ndarray) -> None:
     rng = np.random.default_rng(9)
