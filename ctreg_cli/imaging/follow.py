@@ -145,7 +145,9 @@ class Follower:
         if self._known is None:
             self._age = 0
         distance = np.hypot(*(uv[:, None] - spots.uv_px).transpose(2, 0, 1))
-        due = (np.count_nonzero(distance <= radius[:, None], axis=1) == 1) & np.array([*map(self._is_due, rods)])
+        unknown = np.isin(rods, () if self._known is None else self._known.rods, invert=True)
+        due = (np.count_nonzero(distance <= radius[:, None], axis=1) == 1) & unknown
+        due[due] = [*map(self._is_due, rods[due])]
         if due.any():
             image = UprightImage.of(slice_, bright=self.options.polarity == "bright")
             middles = np.rint(spots.uv_px[distance[due].argmin(axis=1)]).astype(np.intp)
@@ -181,10 +183,13 @@ class Follower:
         off = _length(centre - uv)
         good &= off <= radius
         good &= np.count_nonzero(_length(centre[:, None] - centre) <= RADIUS_PX, axis=1) == 1  # each is near itself
+        # where more has to be looked at than the windows show, and something is there, a rod is known all the same
+        crowded = np.zeros(len(good), dtype=bool)
         beyond = off + radius > RADIUS_PX
-        if any(beyond.tolist()):  # the windows do not show all that was to be looked at
+        if any(beyond.tolist()):
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
-            good &= ~beyond | windows.nothing_else(centre, uv, radius, level, good)
+            crowded = good & beyond & ~windows.nothing_else(centre, uv, radius, level, good)
+            good &= ~crowded
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
@@ -207,8 +212,9 @@ class Follower:
         if all(good.tolist()):
             self._known = known
             return spots, good
-        if good.any():
-            self._known = known.take(good)
+        still_known = good | (crowded & np.isfinite(covariance[:, 0, 0]))
+        if still_known.any():
+            self._known = known.take(still_known)
         return spots.take(good), good
 
 
