@@ -43,6 +43,7 @@ from tests.oracle import (
     OracleScene,
     bound,
     cross_line,
+    cross_lines,
     cross_rod,
     numeric_jacobian,
     random_frame,
@@ -120,7 +121,7 @@ def oracle_log_odds(
 ) -> float:
     """ln odds of a labelled match at a pose against clutter, with numeric derivatives and no prior on the tilt."""
     sd = world.sd_px
-    predicted = np.array([cross_line(frame.starts[i], frame.ends[i], R, t) / world.mm_per_px for i in rods])
+    predicted = cross_lines(frame.starts[rods], frame.ends[rods], R, t) / world.mm_per_px
     chi2 = float((((world.uv_px[spots] - predicted) / sd) ** 2).sum())
     J = numeric_jacobian(frame, rods, R, t, world.mm_per_px) / sd
     _, logdet = np.linalg.slogdet(J.T @ J)
@@ -153,14 +154,11 @@ def fitted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The oracle's own least squares from a start: the naive pipeline of SciPy."""
 
+    starts, ends, seen = frame.starts[rods], frame.ends[rods], world.uv_px[spots]
+
     def residual(x: np.ndarray) -> np.ndarray:
         R1 = Rotation.from_rotvec(x[3:]).as_matrix() @ R
-        return np.concatenate(
-            [
-                world.uv_px[s] - cross_line(frame.starts[i], frame.ends[i], R1, t + x[:3]) / world.mm_per_px
-                for i, s in zip(rods, spots, strict=True)
-            ]
-        )
+        return np.asarray((seen - cross_lines(starts, ends, R1, t + x[:3]) / world.mm_per_px).ravel())
 
     x = least_squares(residual, np.zeros(6), x_scale=[1, 1, 1, 0.03, 0.03, 0.03]).x
     return Rotation.from_rotvec(x[3:]).as_matrix() @ R, t + x[:3]
@@ -185,10 +183,12 @@ def _settled(
     weak = axes[:, -1]
     step = WRONG_SD * min(sd_turn / np.linalg.norm(weak[3:]), sd_place / np.linalg.norm(G @ weak))
 
+    starts, ends, seen = frame.starts[rods], frame.ends[rods], world.uv_px[spots]
+
     def residual(twist: np.ndarray, R0: np.ndarray, t0: np.ndarray) -> np.ndarray:
         R1 = Rotation.from_rotvec(twist[3:]).as_matrix() @ R0
-        predicted = [cross_line(frame.starts[i], frame.ends[i], R1, t0 + twist[:3]) / world.mm_per_px for i in rods]
-        return (world.uv_px[spots] - predicted).ravel() / world.sd_px
+        predicted = cross_lines(starts, ends, R1, t0 + twist[:3]) / world.mm_per_px
+        return np.asarray((seen - predicted).ravel() / world.sd_px)
 
     least = (residual(np.zeros(6), R, t) ** 2).sum()
     for sign in (1, -1):

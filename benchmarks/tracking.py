@@ -38,7 +38,7 @@ from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.tracking.experiment import displaced_start
 from ctreg_cli.tracking.servo import Desired, ServoOptions, servo, view
-from tests.oracle import OracleScene, bound, cross_line, numeric_jacobian, twist_error
+from tests.oracle import OracleScene, bound, cross_line, cross_lines, numeric_jacobian, twist_error
 from tests.tracking.sequences import Sequence, TrueSlice, error_of, is_wrong, sequence
 
 #: five spots are the fewest that leave something to check them by
@@ -173,7 +173,7 @@ def _log_odds(
     S = np.diag(past.sd**2) + G @ bound(made.frame, rods, R, t, world.mm_per_px, world.sd_px) @ G.T
     moved = _about_middle(made, R, t, past.true.R, past.true.t)
     density = -0.5 * float(moved @ np.linalg.solve(S, moved)) - 0.5 * np.linalg.slogdet(2 * math.pi * S)[1]
-    predicted = np.array([cross_line(made.frame.starts[i], made.frame.ends[i], R, t) / world.mm_per_px for i in rods])
+    predicted = cross_lines(made.frame.starts[rods], made.frame.ends[rods], R, t) / world.mm_per_px
     reach = 1.25 * np.linalg.norm(predicted - predicted.mean(axis=0), axis=1).max()
     area = max(math.pi * reach**2, float(np.prod(np.ptp(world.uv_px, axis=0)))) * float(np.prod(world.mm_per_px))
     size = np.linalg.norm(made.frame.starts - made.frame.ends, axis=1).mean()
@@ -190,9 +190,7 @@ def variants(
     made: Sequence, world: OracleScene, R: np.ndarray, t: np.ndarray, rods: list[int], spots: list[int]
 ) -> list[tuple[list[int], list[int]]]:
     """One match dropped, added or given another spot, or two exchanged, where the spots lie near enough."""
-    crossing = np.array(
-        [cross_line(a, b, R, t) / world.mm_per_px for a, b in zip(made.frame.starts, made.frame.ends, strict=True)]
-    )
+    crossing = cross_lines(made.frame.starts, made.frame.ends, R, t) / world.mm_per_px
     near = np.linalg.norm(crossing[:, None] - world.uv_px, axis=2) < NEAR_PX
     free = [j for j in range(len(world.uv_px)) if j not in spots]
     found: list[dict[int, int]] = []
@@ -232,8 +230,8 @@ def rises(
     values, vectors = np.linalg.eigh(own * np.outer(unit, unit))
 
     def residual(R1: np.ndarray, t1: np.ndarray) -> np.ndarray:
-        predicted = np.concatenate([cross_line(frame.starts[i], frame.ends[i], R1, t1) / s for i in rods])
-        return np.asarray((world.uv_px[spots].ravel() - predicted) / world.sd_px)
+        predicted = cross_lines(frame.starts[rods], frame.ends[rods], R1, t1) / s
+        return np.asarray((world.uv_px[spots] - predicted).ravel() / world.sd_px)
 
     def turned(R1: np.ndarray, t1: np.ndarray, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return Rotation.from_rotvec(twist[3:]).as_matrix() @ R1, t1 + twist[:3]

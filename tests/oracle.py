@@ -60,6 +60,13 @@ def cross_line(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray)
     return (a + a[2] / (a[2] - b[2]) * (b - a))[:2]
 
 
+def cross_lines(starts: np.ndarray, ends: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The same for the unbounded lines of many rods (k, 3): (k, 2)."""
+    a, b = starts @ R.T + t, ends @ R.T + t
+    crossing: np.ndarray = (a + (a[:, 2] / (a[:, 2] - b[:, 2]))[:, None] * (b - a))[:, :2]
+    return crossing
+
+
 def twist_error(R: np.ndarray, t: np.ndarray, R_true: np.ndarray, t_true: np.ndarray) -> np.ndarray:
     """[V; Ω] that takes the true pose to the estimate."""
     return np.concatenate([t - t_true, Rotation.from_matrix(R @ R_true.T).as_rotvec()])
@@ -68,13 +75,14 @@ def twist_error(R: np.ndarray, t: np.ndarray, R_true: np.ndarray, t_true: np.nda
 def numeric_jacobian(frame: OracleFrame, rods: list[int], R: np.ndarray, t: np.ndarray, s: np.ndarray) -> np.ndarray:
     """(2k, 6) derivative of the spots in px by central differences."""
     J = np.zeros((2 * len(rods), 6))
+    starts, ends = frame.starts[rods], frame.ends[rods]
     for column in range(6):
         h = 1e-5
         for sign in (1, -1):
             twist = np.zeros(6)
             twist[column] = sign * h
             R1, t1 = Rotation.from_rotvec(twist[3:]).as_matrix() @ R, t + twist[:3]
-            spots = np.concatenate([cross_line(frame.starts[i], frame.ends[i], R1, t1) / s for i in rods])
+            spots = (cross_lines(starts, ends, R1, t1) / s).ravel()
             J[:, column] += sign * spots / (2 * h)
     return J
 
