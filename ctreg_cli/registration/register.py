@@ -228,8 +228,21 @@ def decide(
     scale: Scale,
     matches: Matches,
     options: RegistrationOptions | None = None,
+    *,
+    frame_is_known: bool = False,
 ) -> Registration:
-    """The verdict on a slice's matches, best first."""
+    """The verdict on a slice's matches, best first.
+
+    Args:
+        model: the rods.
+        scene: the spots in millimetres, and what bears on the pose.
+        spots: the spots, px.
+        scale: mm per pixel.
+        matches: all that could be said, best first.
+        options: integrity risk and alert limit.
+        frame_is_known: the slices before have shown that frame and scale are right, and the best match is where they
+            expect it: what a wrong frame would make of the spots need not be looked for.
+    """
     options = options or RegistrationOptions()
     first = matches.spot_of_rod[0]
     near = [
@@ -251,7 +264,8 @@ def decide(
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return refused("bad_fit")
     if (
-        len(best.missing_rods) >= 2
+        not frame_is_known
+        and len(best.missing_rods) >= 2
         and len(spots) - len(best.rod_index) >= 2
         and _fits_better_loosely(model, scene, best)
     ):

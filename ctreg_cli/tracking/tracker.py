@@ -389,7 +389,15 @@ class Tracker:
         if int((weighed.matches.spot_of_rod[0] >= 0).sum()) < LEAST_MATCHES:
             return Registration(status="no_pose", reason="no_consistent_match", n_spots=len(spots))
         settled = reconciled(weighed)
-        verdict = decide(model, scene, spots, scale, weighed.matches.subset(~settled), self.options.registration)
+        verdict = decide(
+            model,
+            scene,
+            spots,
+            scale,
+            weighed.matches.subset(~settled),
+            self.options.registration,
+            frame_is_known=bool(weighed.near[0]),
+        )
         if verdict.reason == "not_linear" and prediction is not None and len(verdict.candidates) == 1:
             verdict = self._straightened(verdict, weighed, prediction, scene, spots)
         if verdict.status != "ok":
