@@ -795,8 +795,9 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
         order = order[_distinct_poses(model, T[order])[:kept]]
         T, fit = T[order], fit.subset(order)
     # what speaks for another minimum is often a spot that the first one could not use: all vote again
-    T, spot_of_rod = np.concatenate([T, T]), np.concatenate([same[: len(T)], assign(model, scene, T, fit)])
-    return weigh(model, scene, T, spot_of_rod, least_matches)
+    same, again = same[: len(T)], assign(model, scene, T, fit)
+    other = (again != same).any(axis=1)
+    return weigh(model, scene, np.concatenate([T, T[other]]), np.concatenate([same, again[other]]), least_matches)
 
 
 def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:
