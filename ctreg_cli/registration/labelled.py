@@ -154,9 +154,9 @@ def _with_true_covariance(
     seen = Observations(
         uv_px=uv[None], covariance_px=covariance[None], matched=np.ones((1, len(uv)), bool), mm_per_px=scale.mm_per_px
     )
-    widened, _ = covariance_along_the_valley(
+    widened = covariance_along_the_valley(
         model, candidate.T_slice_model, candidate.covariance, seen, inflation=candidate.inflation
-    )
+    ).covariance
     if widened is None:
         return replace(candidate, linear=False)
     return replace(candidate, covariance=frozen(widened, (6, 6)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,13 +26,24 @@ _STRAIGHT_BEND2 = 9.0
 #: a flatter valley widens the covariance, but no more than so many times
 _MOST_WIDENED = 2.5
 #: where the truth would find the pose wrong by so many of *its* sd, it may lie with this probability at most
-_WRONG_SD, _WRONG_P = 6.0, 0.02
+_WRONG_SD, MOST_WRONG_P = 6.0, 0.02
 #: points of the profile on each side
 _POINTS = 8
 #: how far beyond its ends (frame sizes) a matched rod may be cut for the truth to lie there
 _BEYOND_END = 0.02
 #: rise where a rod no longer crosses the slice, and ln of the room beyond which Laplace's method is not believed
 _NO_WAY, _MOST_ROOM = 9.0, 30.0
+
+
+class Valley(NamedTuple):
+    """What the profile of the cost says of a covariance."""
+
+    #: (6, 6) true; None where no ellipsoid describes what is known
+    covariance: FloatArray | None
+    #: what the sd had to be multiplied by, infinity where that does not help
+    factor: float
+    #: probability that the truth lies where it would find the pose wrong; 1 where the profile never rises
+    wrong_p: float
 
 
 def covariance_along_the_valley(
@@ -42,7 +54,7 @@ def covariance_along_the_valley(
     *,
     inflation: float = 1.0,
     prior: PosePrior | None = None,
-) -> tuple[FloatArray | None, float]:
+) -> Valley:
     """Check that the cost rises along the weakest direction as the covariance predicts (± 3 sd), else widen it.
 
     Where it rises less, or its valley bends out of the ellipsoid, the profile is followed outward until it has risen by
@@ -57,7 +69,7 @@ def covariance_along_the_valley(
         prior: what is known of the pose without the spots; None: nothing.
 
     Returns:
-        ``covariance`` itself where it is true; a wider one, with the factor; or None where no ellipsoid describes what
+        With ``covariance`` itself where it is true; with a wider one; or with None where no ellipsoid describes what
         is known: the profile stays flat for too long, or the truth may well lie where the spots say so much more that
         this pose would be wrong by six of the standard deviations there.
     """
@@ -68,25 +80,29 @@ def covariance_along_the_valley(
 
     inward = np.linspace(3, 0, _POINTS, endpoint=False)
     profile = _profile(model, T, seen, axes, sd * np.concatenate([inward, -inward]), prior)
-    if profile.wrong_share() > _WRONG_P:
-        return None, math.inf
+    wrong_p = profile.wrong_p()
+    if wrong_p > MOST_WRONG_P:
+        return Valley(None, math.inf, wrong_p)
     rise, offset = profile.rise, profile.offset
     ends = np.array([0, len(inward)])
     bend2 = ((offset[ends] @ np.linalg.inv(axes).T)[:, :-1] ** 2 / np.maximum(values[:-1], 1e-300)).sum(axis=1)
     if float(rise[ends].min()) > _STRAIGHT_RISE and float(bend2.max()) < _STRAIGHT_BEND2:
-        return covariance, 1.0
+        return Valley(covariance, 1.0, wrong_p)
 
     factors = np.linspace(1, _MOST_WIDENED, _POINTS)
     outward = _profile(model, T, seen, axes, 3 * sd * np.concatenate([factors, -factors]), prior)
     risen = np.maximum.accumulate(outward.rise.reshape(2, -1), axis=1) >= 9
-    if not risen.any(axis=1).all() or profile.joined(outward).wrong_share() > _WRONG_P:
-        return None, math.inf
+    if not risen.any(axis=1).all():
+        return Valley(None, math.inf, 1.0)
+    wrong_p = profile.joined(outward).wrong_p()
+    if wrong_p > MOST_WRONG_P:
+        return Valley(None, math.inf, wrong_p)
     offset = outward.offset
     ends = risen.argmax(axis=1)
     # the valley may bend: the ellipsoid has to reach its ends where they are, not where its axis points
     reach, straight = offset.reshape(2, -1, 6)[[0, 1], ends] / 3, axes[:, -1] * sd
     spread = reach.T @ reach / 2 - np.outer(straight, straight)
-    return covariance + inflation**2 * positive_part(spread), float(factors[ends].max())
+    return Valley(covariance + inflation**2 * positive_part(spread), float(factors[ends].max()), wrong_p)
 
 
 def positive_part(M: FloatArray) -> FloatArray:
@@ -117,7 +133,7 @@ class _Profile:
             **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__dataclass_fields__}
         )
 
-    def wrong_share(self) -> float:
+    def wrong_p(self) -> float:
         """The posterior probability that the truth lies where it would find the pose wrong (Laplace's method)."""
         order = np.argsort(self.step)
         step = self.step[order]

@@ -15,7 +15,7 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.integrity import protection_levels
-from ctreg_cli.registration.linearity import covariance_along_the_valley, positive_part
+from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley, covariance_along_the_valley, positive_part
 from ctreg_cli.registration.matching import Matches, Scene, doubt, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import RegistrationOptions
@@ -276,17 +276,23 @@ def decide(
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
-    (straight, factor), *variants = (_along_its_valley(model, scene, c) for c in (best, *doubts))
-    doubts = [variant for variant, _ in variants if variant is not None]
-    if straight is None or len(doubts) < len(variants):  # what may well be true must be told too
+    valley, *others = (_valley(model, scene, c) for c in (best, *doubts))
+    if valley.covariance is None or untold_p(best, doubts, others) > MOST_WRONG_P:
         return Registration(
             status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
         )
-    if straight is not best:
-        best = straight
+    if valley.covariance is not best.covariance:
+        best = replace(best, covariance=frozen(valley.covariance, (6, 6)))
         warnings.append(
-            ("curved_cost", f"the cost is no ellipsoid along its weakest direction; sd widened {factor:.2f} times")
+            (
+                "curved_cost",
+                f"the cost is no ellipsoid along its weakest direction; sd widened {valley.factor:.2f} times",
+            )
         )
+    doubts = [
+        c if other.covariance is None else replace(c, covariance=frozen(other.covariance, (6, 6)))
+        for c, other in zip(doubts, others, strict=True)
+    ]
     covariance, suspicion = covariance_with_misfit(
         model, best.T_slice_model, best.covariance, _seen_or_nearly(model, scene, scale, best)
     )
@@ -316,14 +322,18 @@ def decide(
     return Registration(status="ok", reason="", candidates=(best,), n_spots=len(spots), warnings=tuple(warnings))
 
 
-def _along_its_valley(model: RodModel, scene: Scene, c: Candidate) -> tuple[Candidate | None, float]:
-    """A candidate with a true covariance, None where there is no such; and the factor it was widened by."""
-    covariance, factor = covariance_along_the_valley(
+def _valley(model: RodModel, scene: Scene, c: Candidate) -> Valley:
+    """Whether a candidate's covariance is true."""
+    return covariance_along_the_valley(
         model, c.T_slice_model, c.covariance, _seen_by(model, scene, c), inflation=c.inflation, prior=scene.prior
     )
-    if covariance is None:
-        return None, factor
-    return (c if covariance is c.covariance else replace(c, covariance=frozen(covariance, (6, 6)))), factor
+
+
+def untold_p(best: Candidate, doubts: list[Candidate], valleys: list[Valley]) -> float:
+    """The probability that one of the doubts is true, and lies where no covariance of its own tells of it."""
+    weights = np.exp([c.log_odds - best.log_odds for c in doubts])
+    untold = [valley.wrong_p if valley.covariance is None else 0.0 for valley in valleys]
+    return float(weights @ untold / (1 + weights.sum())) if doubts else 0.0
 
 
 def doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:

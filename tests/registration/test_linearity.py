@@ -55,6 +55,6 @@ def test_a_well_seen_frame_keeps_its_covariance() -> None:
         mm_per_px=world.mm_per_px,
     )
     C = bound(frame, order, world.R, world.t, world.mm_per_px, world.sd_px)
-    covariance, factor = covariance_along_the_valley(model_of(frame), world.T, C, seen)
+    covariance, factor, _ = covariance_along_the_valley(model_of(frame), world.T, C, seen)
     assert factor == 1.0
     assert covariance is C

@@ -10,7 +10,8 @@ import pytest
 
 from ctreg_cli.arrays import frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.registration.register import RIVAL_LOG_ODDS, accepted_log_odds, doubts_and_rivals
+from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley
+from ctreg_cli.registration.register import RIVAL_LOG_ODDS, accepted_log_odds, doubts_and_rivals, untold_p
 from ctreg_cli.registration.result import Candidate
 
 
@@ -68,6 +69,19 @@ def test_another_frame_of_other_spots_is_a_rival_whatever_its_odds() -> None:
     assert doubts_and_rivals([best, second]) == ([], [second])
     assert doubts_and_rivals([best, of_the_same]) == ([], [])
     assert doubts_and_rivals([best, chance]) == ([], [])
+
+
+def test_what_a_doubt_leaves_untold_counts_by_its_probability() -> None:
+    """A variant of the match for which no covariance is true: with what probability is it so, and matters?"""
+    best, told = candidate(20.0), Valley(np.eye(6), 1.0, 0.0)
+    flat, bent = Valley(None, math.inf, 1.0), Valley(None, math.inf, 0.03)
+    for behind, valley in ((1.0, flat), (4.5, flat), (0.0, bent), (1.0, told)):
+        p = math.exp(-behind) / (1 + math.exp(-behind))
+        expected = 0.0 if valley is told else p * valley.wrong_p
+        assert untold_p(best, [candidate(20.0 - behind)], [valley]) == pytest.approx(expected)
+    assert untold_p(best, [], []) == 0.0
+    assert untold_p(best, [candidate(19.0), candidate(19.0)], [flat, flat]) > MOST_WRONG_P
+    assert untold_p(best, [candidate(15.5), candidate(15.5)], [flat, told]) < MOST_WRONG_P
 
 
 @pytest.mark.parametrize("matches", [4, 5, 9])
