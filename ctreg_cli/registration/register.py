@@ -26,7 +26,7 @@ from ctreg_cli.registration.refine import (
     refine,
 )
 from ctreg_cli.registration.result import Candidate, Registration
-from ctreg_cli.registration.twins import with_twins
+from ctreg_cli.registration.twins import Twin, twins, with_twins
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
@@ -272,7 +272,7 @@ def decide(
         return refused("bad_fit")
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
-    doubts, rivals = doubts_and_rivals(candidates)
+    doubts, rivals = doubts_and_rivals(candidates, twins(model))
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
@@ -336,10 +336,14 @@ def untold_p(best: Candidate, doubts: list[Candidate], valleys: list[Valley]) ->
     return float(weights @ untold / (1 + weights.sum())) if doubts else 0.0
 
 
-def doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+def doubts_and_rivals(
+    candidates: list[Candidate], symmetric: tuple[Twin, ...] = ()
+) -> tuple[list[Candidate], list[Candidate]]:
     """What else explains the spots: variants of the best match that do not contradict it, and poses that do.
 
-    The rivals are one of each pose, and none where all of them together are too improbable to count.
+    The rivals are one of each pose, and none where all of them together are too improbable to count. A twin that
+    explains all spots but one always counts: one false spot is all it takes to turn the frame round, and clutter comes
+    in lines and grids, not as evenly as the odds have it.
     """
     best, others = candidates[0], candidates[1:]
     agrees = [_knows_less(c, best) or (pose_distance_sd(best, c) <= RIVAL_SD and not _refutes(c, best)) for c in others]
@@ -348,7 +352,18 @@ def doubts_and_rivals(candidates: list[Candidate]) -> tuple[list[Candidate], lis
     rivals = _distinct_poses([c for c, agreed in zip(others, agrees, strict=True) if not agreed])
     weight = sum(math.exp(c.log_odds - best.log_odds) for c in rivals)
     second = any(is_second_frame(best.spot_index, c.spot_index, c.log_odds) for c in rivals)
-    return doubts, rivals if second or weight > math.exp(-RIVAL_LOG_ODDS) else []
+    turned = any(_is_twin_but_for_a_spot(best, c, symmetric) for c in rivals)
+    return doubts, rivals if second or turned or weight > math.exp(-RIVAL_LOG_ODDS) else []
+
+
+def _is_twin_but_for_a_spot(best: Candidate, c: Candidate, symmetric: tuple[Twin, ...]) -> bool:
+    """Whether ``c`` is ``best`` seen in the frame's mirror, and only one spot tells the two apart."""
+    if len(np.setdiff1d(best.spot_index, c.spot_index)) != 1:
+        return False
+    own = dict(zip(best.rod_index.tolist(), best.spot_index.tolist(), strict=True))
+    other = zip(c.rod_index.tolist(), c.spot_index.tolist(), strict=True)
+    same = [[own.get(int(twin.image[rod])) == spot for twin in symmetric] for rod, spot in other]
+    return bool(symmetric) and max(map(sum, zip(*same, strict=True))) >= len(same) - 1
 
 
 def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:

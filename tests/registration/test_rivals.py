@@ -13,6 +13,7 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley
 from ctreg_cli.registration.register import RIVAL_LOG_ODDS, accepted_log_odds, doubts_and_rivals, untold_p
 from ctreg_cli.registration.result import Candidate
+from ctreg_cli.registration.twins import Twin
 
 
 def candidate(
@@ -82,6 +83,20 @@ def test_what_a_doubt_leaves_untold_counts_by_its_probability() -> None:
     assert untold_p(best, [], []) == 0.0
     assert untold_p(best, [candidate(19.0), candidate(19.0)], [flat, flat]) > MOST_WRONG_P
     assert untold_p(best, [candidate(15.5), candidate(15.5)], [flat, told]) < MOST_WRONG_P
+
+
+def test_a_single_spot_does_not_turn_a_symmetric_frame_round() -> None:
+    """Whatever its odds: the twin's matches are the image of the best's, but for one spot that it leaves over."""
+    half_turn = Twin(transform=np.diag([-1.0, -1.0, 1.0, 1.0]), image=np.arange(6)[::-1].copy())
+    best = candidate(20.0, spots=(0, 1, 2, 3, 4, 5))
+    behind = 20.0 - RIVAL_LOG_ODDS - 1
+    twin = candidate(behind, turn_deg=180, spots=(5, 4, 3, 2, 1))
+    unlike = candidate(behind, turn_deg=180, spots=(1, 4, 2, 3, 5))
+    needs_two = candidate(behind, turn_deg=180, spots=(5, 4, 3, 2))
+    assert doubts_and_rivals([best, twin], (half_turn,)) == ([], [twin])
+    for rival in (unlike, needs_two):
+        assert doubts_and_rivals([best, rival], (half_turn,)) == ([], [])
+    assert doubts_and_rivals([best, twin]) == ([], [])
 
 
 @pytest.mark.parametrize("matches", [4, 5, 9])
