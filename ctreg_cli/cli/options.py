@@ -62,6 +62,16 @@ ModelName = Annotated[
         show_default=False,
     ),
 ]
+ModelForSpots = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="FRAME",
+        help="Frame whose rods' diameters set the expected size of spots.  [default: none; round ones up to 10 mm]",
+        show_default=False,
+    ),
+]
 Outputs = Annotated[
     list[str] | None,
     typer.Option(

@@ -8,6 +8,7 @@ from ctreg_cli.cli import options as opt
 def segment(
     inputs: opt.Inputs,
     output: opt.Outputs = None,
+    model: opt.ModelForSpots = None,
     polarity: opt.PolarityChoice = opt.Polarity.bright,
     series: opt.SeriesNumber = None,
     spot_sd: opt.SpotSd = None,
@@ -25,6 +26,7 @@ def segment(
     \b
     Examples:
       ctreg segment slices/ -o spots.csv --overlay pictures/
+      ctreg segment slices/ -m frame.yaml -v -o spots.json
       ctreg segment slices/ -o - | ctreg pose - -m frame.yaml
     """
     import sys
@@ -35,14 +37,18 @@ def segment(
     from ctreg_cli.cli.summary import SpotTally
     from ctreg_cli.imaging.segmentation import SegmentationOptions
     from ctreg_cli.imaging.spot_slice import SpotSlice
+    from ctreg_cli.io.rod_file import load_rod_model
     from ctreg_cli.io.sinks import check_outputs, open_sinks
     from ctreg_cli.io.spots_file import numbered, spots_encoding
+    from ctreg_cli.pipeline import expecting
     from ctreg_cli.pipeline import segment as segment_slices
 
     outputs = check_outputs(output, inputs)
     talk = Talk(quiet=quiet, verbose=verbose, outputs=outputs)
     source = open_inputs(inputs, talk, series=series, spot_sd_px=spot_sd)
     segmentation = SegmentationOptions(polarity=polarity.value)
+    if model is not None:
+        segmentation = expecting(load_rod_model(model), segmentation)
     overlays = None
     if overlay:
         from ctreg_cli.cli.overlays import OverlayWriter

@@ -52,7 +52,7 @@ def test_segment_finds_every_rod(two_slices: Path, truth: dict[str, dict[str, An
         assert document.info.T_patient_slice is not None
 
 
-@pytest.mark.parametrize("command", ["calibrate", "pose", "track", "model refine"])
+@pytest.mark.parametrize("command", ["segment", "calibrate", "pose", "track", "model refine"])
 def test_commands_that_know_the_frame_expect_its_rods(
     command: str, two_slices: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -64,7 +64,7 @@ def test_commands_that_know_the_frame_expect_its_rods(
         return find_spots(slice_, options)
 
     monkeypatch.setattr(pipeline, "find_spots", find)
-    out = tmp_path / ("out.csv" if command in ("pose", "track") else "out.yaml")
+    out = tmp_path / ("out.csv" if command in ("segment", "pose", "track") else "out.yaml")
     # two slices do not determine the rods: what becomes of them is another test's business
     CliRunner().invoke(app, [*command.split(), str(two_slices), "-m", FRAME, "-o", str(out)])
     assert expected == {(1.0, 1.0)}
