@@ -282,17 +282,14 @@ def decide(
             status="ambiguous", reason="not_linear", candidates=(best, *rivals), n_spots=len(spots), warnings=()
         )
     if valley.covariance is not best.covariance:
-        best = replace(best, covariance=frozen(valley.covariance, (6, 6)))
+        best = _told(best, valley)
         warnings.append(
             (
                 "curved_cost",
                 f"the cost is no ellipsoid along its weakest direction; sd widened {valley.factor:.2f} times",
             )
         )
-    doubts = [
-        c if other.covariance is None else replace(c, covariance=frozen(other.covariance, (6, 6)))
-        for c, other in zip(doubts, others, strict=True)
-    ]
+    doubts = [_told(c, other) for c, other in zip(doubts, others, strict=True)]
     covariance, suspicion = covariance_with_misfit(
         model, best.T_slice_model, best.covariance, _seen_or_nearly(model, scene, scale, best)
     )
@@ -327,6 +324,13 @@ def _valley(model: RodModel, scene: Scene, c: Candidate) -> Valley:
     return covariance_along_the_valley(
         model, c.T_slice_model, c.covariance, _seen_by(model, scene, c), inflation=c.inflation, prior=scene.prior
     )
+
+
+def _told(c: Candidate, valley: Valley) -> Candidate:
+    """A candidate with the covariance that is true, where there is one."""
+    if valley.covariance is None or valley.covariance is c.covariance:
+        return c
+    return replace(c, covariance=frozen(valley.covariance, (6, 6)))
 
 
 def untold_p(best: Candidate, doubts: list[Candidate], valleys: list[Valley]) -> float:
