@@ -42,7 +42,6 @@ from tests.oracle import (
     OracleFrame,
     OracleScene,
     bound,
-    cross_line,
     cross_lines,
     cross_rod,
     numeric_jacobian,
@@ -546,7 +545,7 @@ def _scale_bound(frame: OracleFrame, made: list[OracleScene]) -> np.ndarray:
     for world in made:
         rods = [int(r) for r in world.rod_of_spot]
         J = numeric_jacobian(frame, rods, world.R, world.t, world.mm_per_px) / world.sd_px
-        spots = np.array([cross_line(frame.starts[i], frame.ends[i], world.R, world.t) for i in rods])
+        spots = cross_lines(frame.starts[rods], frame.ends[rods], world.R, world.t)
         K = np.zeros((2 * len(rods), 2))
         K[0::2, 0] = -spots[:, 0] / world.mm_per_px[0] ** 2 / world.sd_px
         K[1::2, 1] = -spots[:, 1] / world.mm_per_px[1] ** 2 / world.sd_px

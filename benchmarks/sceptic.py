@@ -15,14 +15,14 @@ import math
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.accuracy import at_arm, model_of
+from benchmarks.accuracy import WRONG_SD, at_arm, model_of
+from ctreg_cli.geometry.pose import make_pose
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.io.rod_file import load_rod_model
+from ctreg_cli.io.rod_file import load_rod_model, shipped_frames
 from ctreg_cli.registration.matching import doubt, search, weigh
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import least_matches, make_scene, register
@@ -32,10 +32,7 @@ from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from tests.oracle import cross_rod, random_frame, twist_error
 
-FRAMES = Path(__file__).parent.parent / "configs" / "frames"
 CLUTTER = ("none", "random", "line", "grid", "copy", "mirror")
-#: own sds beyond which an ``ok`` is wrong
-WRONG_SD = 6.0
 #: a slice is about so many pixels across the frame
 ACROSS_PX = 300
 
@@ -57,16 +54,14 @@ class Attack:
     resolution_px: float
 
     @property
-    def truth(self) -> np.ndarray:
-        """(4, 4) slice ← model."""
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = self.R, self.t
-        return T
+    def options(self) -> RegistrationOptions:
+        """What ctreg may use."""
+        return RegistrationOptions(use_mount=self.mounted)
 
 
 def frame_names() -> list[str]:
     """The known frames, and a random one."""
-    return [*sorted(path.stem for path in FRAMES.glob("*.yaml")), "random"]
+    return [*sorted(shipped_frames()), "random"]
 
 
 def attack(seed: int, index: int) -> Attack:
@@ -75,11 +70,7 @@ def attack(seed: int, index: int) -> Attack:
     names = frame_names()
     while True:
         name = names[index % len(names)]
-        model = (
-            model_of(random_frame(rng, int(rng.integers(5, 10))))
-            if name == "random"
-            else load_rod_model(FRAMES / f"{name}.yaml")
-        )
+        model = model_of(random_frame(rng, int(rng.integers(5, 10)))) if name == "random" else load_rod_model(name)
         mounted = model.mount is not None and bool(rng.integers(2))
         if model.mount is not None:
             upright = np.asarray(model.mount.patient_from_model)
@@ -186,8 +177,7 @@ def seen(scene: Attack) -> Spots:
 
 def asked(scene: Attack) -> Registration:
     """What ctreg says of it."""
-    options = RegistrationOptions(use_mount=scene.mounted)
-    return register(seen(scene), scene.model, scale=scene.scale, options=options)
+    return register(seen(scene), scene.model, scale=scene.scale, options=scene.options)
 
 
 def own_sds(scene: Attack, T: np.ndarray, covariance: np.ndarray) -> tuple[float, float, float]:
@@ -230,8 +220,7 @@ def take_apart(seed: int, index: int) -> None:
     """Print a scene's candidates beside the match of the truth."""
     print(run((seed, index)))
     scene = attack(seed, index)
-    options = RegistrationOptions(use_mount=scene.mounted)
-    place = make_scene(seen(scene), scene.model, scene.scale, options=options)
+    place = make_scene(seen(scene), scene.model, scene.scale, options=scene.options)
     least = least_matches(len(scene.uv_px), len(scene.model))
     matches = search(scene.model, place, least_matches=least)
     true = np.full((1, len(scene.model)), -1, dtype=np.intp)
@@ -239,7 +228,7 @@ def take_apart(seed: int, index: int) -> None:
         if rod >= 0:
             true[0, rod] = spot
     print("truth", true[0], "noise", scene.noise_px, "scale", scene.scale)
-    weighed = weigh(scene.model, place, scene.truth[None], true, 3)
+    weighed = weigh(scene.model, place, make_pose(scene.R, scene.t)[None], true, 3)
     if weighed is not None:
         turned = own_sds(scene, weighed.T[0], np.eye(6))
         print(

@@ -38,7 +38,7 @@ from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.tracking.experiment import displaced_start
 from ctreg_cli.tracking.servo import Desired, ServoOptions, servo, view
-from tests.oracle import OracleScene, bound, cross_line, cross_lines, numeric_jacobian, twist_error
+from tests.oracle import OracleScene, bound, cross_lines, numeric_jacobian, twist_error
 from tests.tracking.sequences import Sequence, TrueSlice, error_of, is_wrong, sequence
 
 #: five spots are the fewest that leave something to check them by
@@ -364,12 +364,9 @@ def table_basin(starts: int, gain: float) -> None:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(np.radians([7.0, -5.0, 17.0])).as_matrix()
     T[:3, 3] = np.array([125.0, 125.0, 0.0]) - T[:3, :3] @ model.centre
-    spots = [
-        cross_line(a, b, T[:3, :3], T[:3, 3])
-        for a, b in zip(model.starts, model.starts + model.directions, strict=True)
-    ]
+    spots = cross_lines(model.starts, model.starts + model.directions, T[:3, :3], T[:3, 3])
     unit_sd = np.broadcast_to(np.eye(2), (len(model), 2, 2))
-    desired = Desired.of(model, np.arange(len(model)), np.array(spots), unit_sd)
+    desired = Desired.of(model, np.arange(len(model)), spots, unit_sd)
     options = ServoOptions(gain=gain, spot_tolerance_sd=1e-6, max_iterations=400)
     print(
         f"rod cube, gain {gain:g}, {starts} starts each: share that comes home, median iterations (to 1e-6 mm of spots)"

@@ -56,8 +56,8 @@ def cross_rod(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray) 
 
 def cross_line(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The same for the unbounded line."""
-    a, b = R @ start + t, R @ end + t
-    return (a + a[2] / (a[2] - b[2]) * (b - a))[:2]
+    crossing: np.ndarray = cross_lines(start[None], end[None], R, t)[0]
+    return crossing
 
 
 def cross_lines(starts: np.ndarray, ends: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
