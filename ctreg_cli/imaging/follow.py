@@ -43,9 +43,10 @@ from ctreg_cli.imaging.localisation import (
     root_pixel_weights,
     structure_near,
 )
+from ctreg_cli.imaging.peaks import rate_peaks
 from ctreg_cli.imaging.plateau import LONG_RATIO, LongSpots
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
-from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, measure_spots
+from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SMOOTHING_LOSS, SegmentationOptions, measure_spots
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.imaging.window import UprightImage, disc, grid
@@ -54,7 +55,7 @@ from ctreg_cli.imaging.window import UprightImage, disc, grid
 RADIUS_PX = 8
 #: steps at most; the last must have moved the contours by less than this (in half widths) and changed height, shape and
 #: flatness by less than this (in ln)
-MAX_STEPS, LAST_STEP, LAST_STEP_LN = 3, 0.06, 0.12
+MAX_STEPS, LAST_STEP, LAST_STEP_LN = 5, 0.06, 0.12
 #: height and shape change by about so much (in ln) from slice to slice: where a spot is cut off, its pixels tell little
 #: of its height, and what they tell shall not throw the fit about; the centre is not touched by any of that
 SLICE_TO_SLICE_LN = 0.1
@@ -188,7 +189,8 @@ class Follower:
         beyond = off + radius > RADIUS_PX
         if any(beyond.tolist()):
             level = fitted.parameters[BACKGROUND] + known.most_beside(fitted.height)
-            crowded = good & beyond & ~windows.nothing_else(centre, uv, radius, level, good)
+            least = SMOOTHING_LOSS * self.options.min_relative_contrast * float(fitted.height.max())
+            crowded = good & beyond & ~windows.nothing_else(centre, uv, radius, level, good, least)
             good &= ~crowded
 
         formal = _formal_variance(fitted.parameters, shift)
@@ -471,6 +473,8 @@ def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:
 class _Windows(NamedTuple):
     """The pixels of a slice, spots upright; only integers, so that each is a value."""
 
+    source: Slice
+    is_bright: bool
     #: the image in one line
     stored: NDArray[Any]
     shape: tuple[int, int]
@@ -486,6 +490,8 @@ class _Windows(NamedTuple):
         if padding is not None and sign < 0:
             padding = -padding[1], -padding[0]
         return cls(
+            source=slice_,
+            is_bright=bright,
             stored=slice_.stored.reshape(-1),
             shape=slice_.stored.shape,
             sign=sign,
@@ -513,13 +519,13 @@ class _Windows(NamedTuple):
         return middles, values, (centre - middles).T, good
 
     def nothing_else(
-        self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray, good: BoolArray
+        self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray, good: BoolArray, least: float
     ) -> BoolArray:
         """Whether no peak within ``radius`` (k,) of ``uv`` (k, 2) is above a ``level`` (k,) but the spots themselves.
 
         Those are what lies in the windows about the ``centre`` (k, 2) of each ``good`` (k,) one, which have been looked
         at; about ``uv`` of the others all will be measured in full. A streak that only rises towards something farther
-        off has no peak.
+        off has no peak, and one that stands out of what is about it by less than ``least`` could be no spot.
         """
         reach = math.ceil(float(radius.max()))
         middles = np.rint(uv)
@@ -537,13 +543,14 @@ class _Windows(NamedTuple):
         spot, at = spot[unseen], at[unseen].astype(np.intp)
         clear = self._inside(middles, reach + 2)
         if len(spot):
-            clear[spot[self._has_peak(at)]] = False
+            clear[spot[self._has_peak(at, least)]] = False
         return clear
 
-    def _has_peak(self, pixels: IntArray) -> BoolArray:
+    def _has_peak(self, pixels: IntArray, least: float) -> BoolArray:
         """Whether (m,) one of the nine pixels about each of ``pixels`` (m, 2) is brighter than its own neighbours.
 
-        Means of nine pixels are compared, so that noise does not make peaks of its own. Next to padding all is a peak.
+        Means of nine pixels are compared, so that noise does not make peaks of its own. These must stand out by
+        ``least``, as :func:`~ctreg_cli.imaging.peaks.rate_peaks` sees it. Next to padding all is a peak.
         """
         rows, columns = self.shape
         u, v = pixels.T
@@ -554,6 +561,12 @@ class _Windows(NamedTuple):
         means = np.lib.stride_tricks.sliding_window_view(values, (3, 3), axis=(1, 2)).mean(axis=(3, 4))
         greatest = np.lib.stride_tricks.sliding_window_view(means, (3, 3), axis=(1, 2)).max(axis=(3, 4))
         peak = (means[:, 1:-1, 1:-1] >= greatest).any(axis=(1, 2))
+        at_peak = np.flatnonzero(peak & inside)
+        if len(at_peak):
+            image = UprightImage.of(self.source, bright=self.is_bright)
+            heights = means[at_peak, 1:-1, 1:-1].max(axis=(1, 2))
+            rated = rate_peaks(image, pixels[at_peak], heights, 0.5 * RADIUS_PX)
+            peak[at_peak] = rated.contrast >= least
         if self._may_be_padding(values):
             peak |= self._is_padding(values).any(axis=(1, 2))
         return np.asarray(peak | ~inside)

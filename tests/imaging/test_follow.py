@@ -234,6 +234,24 @@ def test_what_only_rises_towards_something_farther_off_is_no_spot(monkeypatch: p
         assert (not counts) == is_followed
 
 
+@pytest.mark.parametrize(("share", "n_in_full"), [(0.05, 0), (0.5, 1)])
+def test_a_peak_on_a_bright_place_counts_only_if_it_could_be_a_spot(
+    share: float, n_in_full: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spots fainter than a tenth of the strongest are left out in the end, so their peaks cost no full fit."""
+    rng, wide = np.random.default_rng(13), np.array([16.0])
+    from_rod = np.mgrid[: SHAPE[0], : SHAPE[1]][1] - UV[0, 0]
+    height = 3071.0  # as the scanner shows it
+    plateau = 0.12 * height / (1.0 + np.exp(-(from_rod - 9.0) / 1.5))
+    peak = render_rod(SHAPE, (48.5, 34.0), contrast=share * height, slope=(0.3, 0.1))
+    follower = Follower()
+    for _ in range(2):
+        assert len(follower.measure(one(rng, more=plateau), ONE, UV, wide)) == 1
+    counts = in_full(monkeypatch)
+    assert len(follower.measure(one(rng, more=plateau + peak), ONE, UV, wide)) == 1 + n_in_full
+    assert len(counts) == n_in_full
+
+
 @pytest.mark.parametrize("uv", [at(6.2, 35.0), at(75.9, 66.1), at(38.0, 2.0)])
 def test_at_the_border_and_in_padding_spots_are_measured_in_full(uv: np.ndarray) -> None:
     rng = np.random.default_rng(9)
