@@ -12,7 +12,8 @@ import typer
 from ctreg_cli.cli.console import Talk, counted
 from ctreg_cli.imaging.slice import Slice, SliceInfo
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
-from ctreg_cli.io.sinks import Sinks, uninterrupted
+from ctreg_cli.io.interrupts import uninterrupted
+from ctreg_cli.io.sinks import Sinks
 from ctreg_cli.io.sources import Source, open_sources
 from ctreg_cli.pipeline import SliceLike
 from ctreg_cli.rods import RodModel

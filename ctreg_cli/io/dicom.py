@@ -22,6 +22,7 @@ from ctreg_cli.io.dicom_header import (
     Header,
     HeaderProblem,
     looks_like_dicom,
+    once_a_series,
     open_binary,
     plain_header,
     problem,
@@ -43,9 +44,8 @@ _LOCALIZER_WORDS = frozenset({"LOCALIZER", "SCOUT", "TOPOGRAM", "SURVIEW"})
 _CAPTURE_WORDS = frozenset({"SCREEN SAVE", "SCREENSAVE", "PROTOCOL", "DOSE_INFO"})
 _CAPTURE_CLASSES = "1.2.840.10008.5.1.4.1.1.7"
 _DIRECTORY_CLASS = "1.2.840.10008.1.3.10"
-_UIDS = {
+_SERIES_UIDS = {
     "sop_class": "SOPClassUID",
-    "sop_instance": "SOPInstanceUID",
     "series_instance": "SeriesInstanceUID",
     "study_instance": "StudyInstanceUID",
     "frame_of_reference": "FrameOfReferenceUID",
@@ -64,7 +64,7 @@ def is_dicom(path: Path, head: bytes) -> bool:
     return looks_like_dicom(head) or path.suffix.lower() in DICOM_SUFFIXES
 
 
-def read_dicom(path: Path, source: str, head: bytes = b"") -> list[ImageRecord] | NotAnImage:
+def read_dicom(path: Path, source: str, head: bytes = b"", size: int | None = None) -> list[ImageRecord] | NotAnImage:
     """Read the header of one file; pixels are read later, by :meth:`ImageRecord.load`.
 
     Args:
@@ -80,7 +80,7 @@ def read_dicom(path: Path, source: str, head: bytes = b"") -> list[ImageRecord] 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what pydicom finds odd is either checked here or harmless
         try:
-            return _read(path, source, head)
+            return _read(path, source, head, path.stat().st_size if size is None else size)
         except HeaderProblem as error:
             return [ImageRecord(info=info, series=_LOST, problem=str(error))]
         except RecursionError:
@@ -91,8 +91,7 @@ def read_dicom(path: Path, source: str, head: bytes = b"") -> list[ImageRecord] 
             return [ImageRecord(info=info, series=_LOST, problem="its header is damaged")]
 
 
-def _read(path: Path, source: str, head: bytes) -> list[ImageRecord] | NotAnImage:
-    size = path.stat().st_size
+def _read(path: Path, source: str, head: bytes, size: int) -> list[ImageRecord] | NotAnImage:
     if size == 0:
         raise HeaderProblem("the file is empty")
     header = plain_header(head, size)
@@ -122,6 +121,13 @@ def _is_not_an_image(header: Header) -> bool:
 
 
 def _series_key(path: Path, elements: Elements) -> SeriesKey:
+    kind, modality = _kind_and_modality(elements)
+    identity = elements.uid("SeriesInstanceUID") or f"folder {path.parent.as_posix()}"
+    return SeriesKey(intern(identity), kind, modality)
+
+
+@once_a_series("ImageType", "SOPClassUID", "Modality")
+def _kind_and_modality(elements: Elements) -> tuple[Kind, str]:
     image_type = set(elements.codes("ImageType"))
     if image_type & _LOCALIZER_WORDS:
         kind = Kind.LOCALIZER
@@ -130,13 +136,18 @@ def _series_key(path: Path, elements: Elements) -> SeriesKey:
     else:
         kind = Kind.SLICE
     modality = elements.text("Modality").upper()
-    identity = elements.uid("SeriesInstanceUID") or f"folder {path.parent.as_posix()}"
-    return SeriesKey(intern(identity), kind, intern(modality) if modality in _MODALITIES else "")
+    return kind, modality if modality in _MODALITIES else ""
 
 
 def _uids(elements: Elements) -> dict[str, str]:
-    uids = {name: elements.uid(keyword) for name, keyword in _UIDS.items()}
-    return {name: intern(uid) for name, uid in uids.items() if uid}
+    uids, own = dict(_series_uids(elements)), elements.uid("SOPInstanceUID")
+    return uids | {"sop_instance": own} if own else uids
+
+
+@once_a_series(*_SERIES_UIDS.values())
+def _series_uids(elements: Elements) -> dict[str, str]:
+    uids = {name: elements.uid(keyword) for name, keyword in _SERIES_UIDS.items()}
+    return {name: uid for name, uid in uids.items() if uid}
 
 
 def _place(elements: Elements) -> tuple[tuple[Instant | None, ...], int | None]:

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, frozen
-from ctreg_cli.io.dicom_header import Elements, problem
+from ctreg_cli.io.dicom_header import Elements, once_a_series, problem
 from ctreg_cli.scale import Scale
 
 #: no scanner's pixel is smaller or larger (mm): beyond, a digit or a decimal point was lost
@@ -17,6 +17,7 @@ PIXEL_SPACING_RANGE_MM = (1e-3, 100.0)
 MAX_ORIENTATION_ERROR = 2e-3
 
 
+@once_a_series("PixelSpacing")
 def read_scale(elements: Elements) -> Scale | None:
     """Pixel Spacing ``[row, column]`` = ``[s_y, s_x]``; None where the file has none.
 
@@ -32,6 +33,7 @@ def read_scale(elements: Elements) -> Scale | None:
     return Scale.from_pixel_spacing(*spacing)
 
 
+@once_a_series("SliceThickness")
 def read_thickness(elements: Elements) -> float | None:
     """Slice Thickness, mm; None where absent or 0, which some writers mean by "unknown".
 

@@ -11,13 +11,13 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
 
 from pydicom.datadict import dictionary_description, tag_for_keyword
 from pydicom.filereader import data_element_generator
@@ -66,6 +66,10 @@ _UID = re.compile(r"[0-9.]{1,64}")
 _BINARY = {"US": "H", "SS": "h", "UL": "I", "SL": "i", "FL": "f", "FD": "d"}
 _INTEGER_BYTES = {code: struct.calcsize(code) for code in "HhIi"}
 _KNOWN_VR = {str(vr).encode() for vr in VR}
+
+
+_More = ParamSpec("_More")
+_Result = TypeVar("_Result")
 
 
 class HeaderProblem(Exception):
@@ -207,9 +211,46 @@ def _text_decimals(value: bytes) -> tuple[float, ...] | None:
     return tuple(map(float, parts)) if all(map(_DECIMAL.fullmatch, parts)) else None
 
 
-#: a series repeats most of its numbers in every slice
-MAX_REPEATED_BYTES = 128
+#: a series repeats most of its numbers in every slice; what is remembered is no longer than this, and of so many
+MAX_REPEATED_BYTES, MAX_REPEATED = 128, 64
 _repeated_decimals = lru_cache(maxsize=256)(_text_decimals)
+
+
+def once_a_series(
+    *keywords: str,
+) -> Callable[[Callable[Concatenate[Elements, _More], _Result]], Callable[Concatenate[Elements, _More], _Result]]:
+    """Of a function of elements that depends on ``keywords`` alone: what it made of the same values the last times.
+
+    The slices of a series differ in their place, time and number; all else is the same bytes in each, and need not be
+    read and checked again. Further arguments are values that can be hashed. What raises is not remembered.
+    """
+    tags = [_TAG[keyword] for keyword in keywords]
+
+    def decorate(
+        read: Callable[Concatenate[Elements, _More], _Result],
+    ) -> Callable[Concatenate[Elements, _More], _Result]:
+        known: dict[tuple[object, ...], _Result] = {}
+
+        @wraps(read)
+        def remembering(elements: Elements, /, *more: _More.args, **named: _More.kwargs) -> _Result:
+            values = [e and (e.VR, e.value) for e in map(elements.raw.get, tags)]
+            key = (elements.little_endian, *more, *values)
+            try:
+                if key in known:
+                    return known[key]
+            except TypeError:  # a sequence where a value is expected
+                return read(elements, *more, **named)
+            result = read(elements, *more, **named)
+            if sum(len(value[1] or b"") for value in values if value) <= MAX_REPEATED_BYTES * len(tags):
+                if len(known) >= MAX_REPEATED:
+                    known.clear()
+                known[key] = result
+            return result
+
+        return remembering
+
+    return decorate
+
 
 #: integers that implicit VR stores as text
 _IS_TEXT = {keyword: keyword in ("InstanceNumber", "NumberOfFrames") for keyword in _TAG}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctreg_cli.io.dicom_header import Elements, problem
+from ctreg_cli.io.dicom_header import Elements, once_a_series, problem
 
 #: the largest CT matrices are 2048 × 2048; a small file must not claim gigabytes
 MAX_PIXELS = 2**25
@@ -47,6 +47,10 @@ class Layout:
         return (-n // 2, n // 2 - 1) if self.signed else (0, n - 1)
 
 
+@once_a_series(
+    *("PhotometricInterpretation", "SamplesPerPixel", "Rows", "Columns", "NumberOfFrames"),
+    *("BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation"),
+)
 def read_layout(elements: Elements) -> Layout:
     """The Image Pixel attributes.
 
@@ -92,6 +96,7 @@ def read_layout(elements: Elements) -> Layout:
     )
 
 
+@once_a_series("RescaleSlope", "RescaleIntercept", "ModalityLUTSequence")
 def read_rescale(elements: Elements, layout: Layout) -> tuple[float, float]:
     """(slope, intercept) of ``value = slope * stored + intercept``; 1 and 0 where the file has none.
 
@@ -112,6 +117,7 @@ def read_rescale(elements: Elements, layout: Layout) -> tuple[float, float]:
     return slope, intercept
 
 
+@once_a_series("PixelPaddingValue", "PixelPaddingRangeLimit")
 def read_padding(elements: Elements, layout: Layout) -> tuple[float, float] | None:
     """Inclusive range of stored values that are no image (PS3.3 C.7.5.1.1.2), or None."""
     value = elements.integer("PixelPaddingValue", signed=layout.signed)

@@ -17,6 +17,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
+from functools import lru_cache
 
 from ctreg_cli.io.dicom_header import Elements, HeaderProblem
 from ctreg_cli.io.image_record import Instant
@@ -122,6 +123,7 @@ def _seconds(instants: Sequence[Instant | None]) -> list[float | None]:
     return times
 
 
+@lru_cache(maxsize=64)
 def _day(text: str) -> int | None:
     match = _DATE.fullmatch(text)
     if match is None:

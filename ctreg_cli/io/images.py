@@ -16,6 +16,7 @@ natural file name and frame. Nothing but headers is read until a slice is asked 
 from __future__ import annotations
 
 import os
+import stat
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -156,6 +157,7 @@ def _find(paths: Sequence[Path]) -> _Found:
     lost: list[ImageRecord] = []
     skipped: Counter[str] = Counter()
     for number, path in enumerate(paths):
+        named_by = number if path.is_dir() else -1
         for file, source in files_in(path, skipped):
             records = read_image_file(file, source)
             if isinstance(records, str):
@@ -169,7 +171,7 @@ def _find(paths: Sequence[Path]) -> _Found:
                     record.series, Series(index=len(by_key) + 1, key=record.series, records=[], inputs=set())
                 )
                 group.records.append(record)
-                group.inputs.add(number if path.is_dir() else -1)
+                group.inputs.add(named_by)
     for group in by_key.values():
         order(group)
     if not by_key and not lost:
@@ -184,11 +186,14 @@ def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
     from ctreg_cli.io.dicom import NotAnImage, is_dicom, read_dicom
     from ctreg_cli.io.dicom_plain import HEAD_BYTES
 
-    if not path.is_file():  # a pipe or a device would be waited for
-        return NOT_A_FILE
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe or a device would be waited for
+            return NOT_A_FILE
         with path.open("rb", buffering=0) as file:
             head = file.read(HEAD_BYTES)
+    except FileNotFoundError:  # a link to nowhere
+        return NOT_A_FILE
     except OSError as error:
         info = SliceInfo(source=source)
         unknown = SeriesKey(None, Kind.SLICE, "")
@@ -197,7 +202,7 @@ def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
         return [read_png(path, source)]
     if not is_dicom(path, head):
         return NOT_AN_IMAGE
-    records = read_dicom(path, source, head)
+    records = read_dicom(path, source, head, status.st_size)
     return NO_PIXELS if isinstance(records, NotAnImage) else records
 
 

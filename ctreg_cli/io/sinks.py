@@ -8,19 +8,17 @@ from __future__ import annotations
 import csv
 import json
 import math
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Generic, Protocol, Self, TextIO, TypeVar
 
 import numpy as np
 
 from ctreg_cli.errors import InputError
 from ctreg_cli.io.atomic import AtomicFile, check_folder
+from ctreg_cli.io.interrupts import records, uninterrupted
 
 Item = TypeVar("Item", contravariant=True)
 
@@ -246,28 +244,6 @@ class TrajectoryFile(Generic[Item]):
         self._file.abandon()
 
 
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back, so that what is written is whole records, and what is said of them is true."""
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    pending = False
-
-    def note(_number: int, _frame: FrameType | None) -> None:
-        nonlocal pending
-        pending = True
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if pending:
-        raise KeyboardInterrupt
-
-
 class Sinks(Generic[Item]):
     """Several outputs as one context: all appear at a clean end **or an interrupt** (with what was finished), none
     after an error.
@@ -281,6 +257,7 @@ class Sinks(Generic[Item]):
 
     def __init__(self, sinks: Sequence[tuple[str, Sink[Item]]] = ()) -> None:
         self._sinks = list(sinks)
+        self._handler = records()
         self._tell: Callable[[str], None] | None = None
         #: what was said of outputs that failed while the others went on
         self.lost: list[str] = []
@@ -326,21 +303,25 @@ class Sinks(Generic[Item]):
         self._tell(text)
 
     def __enter__(self) -> Self:
+        self._handler.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         finish = kind is None or issubclass(kind, KeyboardInterrupt)
-        with uninterrupted():
-            while self._sinks:
-                name, sink = self._sinks.pop(0)
-                try:
-                    self._end(name, sink, finish)
-                except Exception:
-                    for _, other in self._sinks:
-                        other.abandon()
-                    raise
+        try:
+            with uninterrupted():
+                while self._sinks:
+                    name, sink = self._sinks.pop(0)
+                    try:
+                        self._end(name, sink, finish)
+                    except Exception:
+                        for _, other in self._sinks:
+                            other.abandon()
+                        raise
+        finally:
+            self._handler.__exit__(None, None, None)
 
     def _end(self, name: str, sink: Sink[Item], finish: bool) -> None:
         try:
