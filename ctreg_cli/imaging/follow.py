@@ -3,8 +3,8 @@
 The centre always comes from the pixels of the slice at hand. What is kept from slice to slice is what the fit starts
 from (:mod:`.profile`: height, shape, background) and the weights of its pixels; from there one Gauss–Newton step ends
 within a small part of the noise of where the full fit ends. Its covariance follows the law of :mod:`.localisation`:
-structure about the spot is looked for in every slice, the noise is measured every few. Whatever is not plainly what it
-was is measured as in :func:`.segmentation.measure_spots`.
+noise, and structure about the spot, are measured every few slices and when residuals change. Whatever is not plainly
+what it was is measured as in :func:`.segmentation.measure_spots`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ from ctreg_cli.imaging.window import UprightImage, disc, grid
 
 #: radius of the windows, px: the least of those that the search tries
 RADIUS_PX = 8
+#: a spot no farther from the middle of its window than this, px along u and v, is seen as well as one in the middle
+MAX_OFF_MIDDLE_PX = 1.0
 #: steps at most; the last must have moved the contours by less than this (in half widths) and changed height, shape and
 #: flatness by less than this (in ln)
 MAX_STEPS, LAST_STEP, LAST_STEP_LN = 5, 0.06, 0.12
@@ -65,8 +67,11 @@ AXES_MEMORY, MAX_CHANGE, LONG_DOUBT = 4.0, 1.5, 1.15
 #: mean squares of residuals beyond so many times what they were are something new in the window
 MAX_MISFIT = 3.0
 #: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
-#: changes by this factor, or the flatness of a long spot by so much; structure about a spot is looked at in every slice
+#: changes by this factor, or the flatness of a long spot by so much
 LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 32, 1.7, 0.15
+#: structure about a spot is looked for when that mean square changes by this factor: by chance once in fifty slices;
+#: a streak that widens a centre (:data:`~ctreg_cli.imaging.uncertainty.SURE_OF_STRUCTURE`) changes it by more
+STRUCTURE_CHANGE = 1.3
 #: everything is measured in full again after so many slices
 MAX_AGE = 64
 #: after a spot could not be learned, that is not tried for so many slices, twice as many each time
@@ -183,7 +188,7 @@ class Follower:
         centre = middles + fitted.centre.T
         off = _length(centre - uv)
         good &= off <= radius
-        near = _length(centre[:, None] - centre) <= RADIUS_PX
+        near = _near_each_other(centre)
         if np.count_nonzero(near) > len(near):  # each is near itself
             good &= np.count_nonzero(near, axis=1) == 1
         # where more has to be looked at than the windows show, and something is there, a rod is known all the same
@@ -200,10 +205,11 @@ class Follower:
         if self._law_age > LAW_EVERY or any((good & looks.have_changed(known, fitted)).tolist()):
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
-        structure = structure_near(fitted, known.law.rough, RADIUS_PX)
-        covariance = known.law.covariance(structure, formal / known.formal)
+        if looks.may_show_other_structure(known):
+            known.surroundings(structure_near(fitted, known.law.rough, RADIUS_PX), looks)
+        covariance = known.law.covariance(known.structure, formal / known.formal)
         good &= np.isfinite(covariance[:, 0, 0] + covariance[:, 1, 1])
-        spots = Spots(
+        spots = Spots.of_own(
             uv_px=centre,
             covariance_px=covariance,
             area_px=region.area,
@@ -253,11 +259,15 @@ class _Known:
     misfit: FloatArray
     beside: FloatArray
     flatness_then: FloatArray
+    #: variance (k,) of structure about the centres, and how large residuals were when it was looked for
+    structure: FloatArray
+    misfit_then: FloatArray
 
     @classmethod
     def of(cls, rods: IntArray, blobs: Blobs, fitted: Profiles) -> _Known:
         """Of profiles fitted in full."""
         shift, looks, long = centre_columns(fitted.normal), _Looks.of(fitted), fitted.long
+        law = centre_law(fitted, shift, RADIUS_PX)
         background, height, flatness = fitted.parameters[BACKGROUND], fitted.height, fitted.parameters[FLATNESS]
         return cls(
             rods=rods,
@@ -272,11 +282,13 @@ class _Known:
             noise=fitted.noise,
             structure_slope=fitted.structure_slope,
             ceiling=fitted.ceiling,
-            law=centre_law(fitted, shift, RADIUS_PX),
+            law=law,
             formal=_formal_variance(fitted.parameters, shift),
             misfit=looks.misfit,
             beside=looks.beside,
             flatness_then=flatness,
+            structure=structure_near(fitted, law.rough, RADIUS_PX),
+            misfit_then=looks.misfit,
         )
 
     def most_beside(self, height: FloatArray) -> FloatArray:
@@ -289,6 +301,10 @@ class _Known:
         """Remember the law, and what it was measured with."""
         self.law, self.formal, self.misfit, self.beside = law, formal, looks.misfit, looks.beside
         self.flatness_then = fitted.parameters[FLATNESS]
+
+    def surroundings(self, structure: FloatArray, looks: _Looks) -> None:
+        """Remember the structure about the centres, and what residuals it goes with."""
+        self.structure, self.misfit_then = structure, looks.misfit
 
     def seen(self, fitted: Profiles, region: _Region) -> None:
         """Remember how the spots look now."""
@@ -326,7 +342,7 @@ class _Known:
 #: arrays of a :class:`_Known` whose last axis counts the rods
 _OF_EACH = (
     *("parameters", "flatness", "flatness_prior", "axes", "level", "half", "noise", "structure_slope"),
-    *("formal", "misfit", "beside", "flatness_then"),
+    *("formal", "misfit", "beside", "flatness_then", "structure", "misfit_then"),
 )
 
 
@@ -381,6 +397,11 @@ class _Looks(NamedTuple):
         same &= self.height > options.min_contrast_sd * known.law.rough
         return np.asarray(same)
 
+    def may_show_other_structure(self, known: _Known) -> bool:
+        """Whether residuals about any spot differ by more than chance from those its structure was measured in."""
+        change = (self.misfit / known.misfit_then).tolist()
+        return bool(max(change) > STRUCTURE_CHANGE or min(change) < 1.0 / STRUCTURE_CHANGE)
+
     def have_changed(self, known: _Known, fitted: Profiles) -> BoolArray:
         """Whether (k,) things are no longer what they were when the law was measured."""
         change = self.misfit / known.misfit
@@ -406,13 +427,17 @@ def _stepped(
     u, v, _ = _coordinates()
     distance = distance_beyond_edge(region.moments, u - region.middle[:, :1], v - region.middle[:, 1:])
     root_weights = root_pixel_weights(distance, known.noise, known.structure_slope)
-    ceiling = max(known.ceiling, float(values.max()))
-    clipped = values >= ceiling
-    n_clipped = (clipped & region.own).sum(axis=1)
+    brightest_value = float(values.max())
+    ceiling, cut_off = max(known.ceiling, brightest_value), None
+    n_clipped = np.zeros(len(values), dtype=np.intp)
+    if brightest_value >= ceiling:
+        cut_off = values >= ceiling
+        n_clipped = (cut_off & region.own).sum(axis=1)
+    cut = n_clipped > 0
+    if not any(cut.tolist()):
+        cut_off = None
     long = known.long if len(known.long) else None
     along, across = known.coordinates
-    cut = n_clipped > 0
-    cut_off = clipped if any(cut.tolist()) else None
     rows = Rows(along, across, values, cut_off, root_weights, None if long is None else long.mask)
     parameters = known.parameters.copy()
     parameters[CENTRE] = brightest if long is None else long.turned(brightest)
@@ -503,23 +528,27 @@ class _Windows(NamedTuple):
         )
 
     def about(self, uv: FloatArray, known: _Known) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Windows about the centres of gravity of what is bright near ``uv`` (k, 2).
+        """Windows about ``uv`` (k, 2), or if need be about the centres of gravity of what is bright there.
 
         Returns:
             Middle pixels (k, 2), upright values (k, p) on discs about them, those centres (2, k) from the middles, and
             which discs show nothing but image.
         """
-        first = np.rint(uv)
-        weights = self._at(first, RADIUS_PX)
-        weights -= known.level[:, None]
+        middles = np.rint(uv)
+        values = self._at(middles, RADIUS_PX)
+        weights = values - known.level[:, None]
         np.maximum(weights, 0.0, out=weights)
         sums = weights.dot(_coordinates()[2])
-        centre = first + sums[:, :2] / np.maximum(sums[:, 2:], 1e-9)
-        middles = np.rint(centre)
-        values, good = self._at(middles, RADIUS_PX), self._inside(middles, RADIUS_PX)
+        off = sums[:, :2] / np.maximum(sums[:, 2:], 1e-9)
+        if np.abs(off).max() > MAX_OFF_MIDDLE_PX:
+            centre = middles + off
+            middles = np.rint(centre)
+            off = centre - middles
+            values = self._at(middles, RADIUS_PX)
+        good = self._inside(middles, RADIUS_PX)
         if self._may_be_padding(values):
             good &= ~self._is_padding(values).any(axis=1)
-        return middles, values, (centre - middles).T, good
+        return middles, values, off.T, good
 
     def nothing_else(
         self, centre: FloatArray, uv: FloatArray, radius: FloatArray, level: FloatArray, good: BoolArray, least: float
@@ -604,6 +633,16 @@ def _is_plain(slice_: Slice, options: SegmentationOptions) -> bool:
         and stored.flags.c_contiguous
         and min(stored.shape) > 2 * RADIUS_PX
     )
+
+
+def _near_each_other(centre: FloatArray) -> BoolArray:
+    """(k, k) which of the places (k, 2) lie in one another's windows."""
+    u, v = centre.T
+    d_u, d_v = u[:, None] - u, v[:, None] - v
+    d_u *= d_u
+    d_v *= d_v
+    d_u += d_v
+    return np.asarray(d_u <= RADIUS_PX**2)
 
 
 def _length(vectors: FloatArray) -> FloatArray:

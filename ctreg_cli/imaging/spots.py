@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 DEFAULT_SPOT_SD_PX = 0.25
 
 _ARRAYS = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
+_MEASURED: dict[str, object] = {"sd_assumed": False, "rejected": (), "n_rejected": MappingProxyType({})}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,6 +74,17 @@ class Spots:
         """Spots known only by their centres (m, 2), all with the same assumed standard deviation (px)."""
         uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
         return cls(uv_px=uv, covariance_px=np.tile(np.eye(2) * sd_px**2, (len(uv), 1, 1)), sd_assumed=True)
+
+    @classmethod
+    def of_own(cls, **arrays: FloatArray) -> Spots:
+        """Measured spots of arrays that are nobody else's, float64 and of the shapes above: taken over, not copied."""
+        spots = object.__new__(cls)
+        for name, values in arrays.items():
+            values.flags.writeable = False
+            object.__setattr__(spots, name, values)
+        for name, value in _MEASURED.items():
+            object.__setattr__(spots, name, value)
+        return spots
 
     def take(self, which: BoolArray | IntArray) -> Spots:
         """Some of the spots; the rejected candidates stay."""

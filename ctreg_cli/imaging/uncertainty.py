@@ -36,7 +36,7 @@ LEAST_LENGTH_PX = 0.03
 #: sum of the squared weights of a Laplacian: 4² + 4 · 1²
 _SQUARED_WEIGHTS = 20.0
 #: a mirrored pixel lies at most so far beyond the window, px
-_MARGIN = 2
+_MARGIN = 3
 
 
 def ring_spread(blobs: Blobs) -> tuple[FloatArray, FloatArray]:
