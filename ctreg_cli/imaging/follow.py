@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.imaging.blob import (
@@ -69,9 +68,9 @@ MAX_MISFIT = 3.0
 #: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
 #: changes by this factor, or the flatness of a long spot by so much
 LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 32, 1.7, 0.15
-#: structure about a spot is looked for when that mean square changes by this factor: by chance once in fifty slices;
+#: structure about a spot is looked for when that mean square changes by this factor: by chance in one slice of ten;
 #: a streak that widens a centre (:data:`~ctreg_cli.imaging.uncertainty.SURE_OF_STRUCTURE`) changes it by more
-STRUCTURE_CHANGE = 1.3
+STRUCTURE_CHANGE = 1.5
 #: everything is measured in full again after so many slices
 MAX_AGE = 64
 #: after a spot could not be learned, that is not tried for so many slices, twice as many each time
@@ -202,12 +201,14 @@ class Follower:
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
-        if self._law_age > LAW_EVERY or any((good & looks.have_changed(known, fitted)).tolist()):
+        changed = looks.have_changed(known, fitted)
+        is_due = self._law_age > LAW_EVERY or (changed is not None and (good & changed).any())
+        if is_due:
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
-        if looks.may_show_other_structure(known):
+        if is_due or looks.may_show_other_structure(known):
             known.surroundings(structure_near(fitted, known.law.rough, RADIUS_PX), looks)
-        covariance = known.law.covariance(known.structure, formal / known.formal)
+        covariance = known.law.scaled(known.unscaled, formal / known.formal)
         good &= np.isfinite(covariance[:, 0, 0] + covariance[:, 1, 1])
         spots = Spots.of_own(
             uv_px=centre,
@@ -259,15 +260,18 @@ class _Known:
     misfit: FloatArray
     beside: FloatArray
     flatness_then: FloatArray
-    #: variance (k,) of structure about the centres, and how large residuals were when it was looked for
+    #: variance (k,) of structure about the centres, and how large residuals were when it was looked for; what it and
+    #: noise make of the centres (k, 2, 2), see :meth:`~ctreg_cli.imaging.localisation.Law.made_by`
     structure: FloatArray
     misfit_then: FloatArray
+    unscaled: FloatArray
 
     @classmethod
     def of(cls, rods: IntArray, blobs: Blobs, fitted: Profiles) -> _Known:
         """Of profiles fitted in full."""
         shift, looks, long = centre_columns(fitted.normal), _Looks.of(fitted), fitted.long
         law = centre_law(fitted, shift, RADIUS_PX)
+        structure = structure_near(fitted, law.rough, RADIUS_PX)
         background, height, flatness = fitted.parameters[BACKGROUND], fitted.height, fitted.parameters[FLATNESS]
         return cls(
             rods=rods,
@@ -287,8 +291,9 @@ class _Known:
             misfit=looks.misfit,
             beside=looks.beside,
             flatness_then=flatness,
-            structure=structure_near(fitted, law.rough, RADIUS_PX),
+            structure=structure,
             misfit_then=looks.misfit,
+            unscaled=law.made_by(structure),
         )
 
     def most_beside(self, height: FloatArray) -> FloatArray:
@@ -298,13 +303,17 @@ class _Known:
         return limit
 
     def measured(self, law: Law, formal: FloatArray, looks: _Looks, fitted: Profiles) -> None:
-        """Remember the law, and what it was measured with."""
-        self.law, self.formal, self.misfit, self.beside = law, formal, looks.misfit, looks.beside
+        """Remember the law, and what it was measured with.
+
+        Residuals that were small by chance must not make those of the next slice look large: of the mean squares now
+        and then, the geometric mean is what the next are compared with.
+        """
+        self.law, self.formal, self.misfit, self.beside = law, formal, np.sqrt(self.misfit * looks.misfit), looks.beside
         self.flatness_then = fitted.parameters[FLATNESS]
 
     def surroundings(self, structure: FloatArray, looks: _Looks) -> None:
-        """Remember the structure about the centres, and what residuals it goes with."""
-        self.structure, self.misfit_then = structure, looks.misfit
+        """Remember the structure about the centres, what it makes of these, and what residuals it goes with."""
+        self.structure, self.misfit_then, self.unscaled = structure, looks.misfit, self.law.made_by(structure)
 
     def seen(self, fitted: Profiles, region: _Region) -> None:
         """Remember how the spots look now."""
@@ -323,6 +332,7 @@ class _Known:
             coordinates=_coordinates_of(long),
             ceiling=self.ceiling,
             law=self.law.take(which),
+            unscaled=self.unscaled[which],
             **{name: getattr(self, name)[..., which] for name in _OF_EACH},
         )
 
@@ -335,6 +345,7 @@ class _Known:
             coordinates=_coordinates_of(long),
             ceiling=max(self.ceiling, other.ceiling),
             law=self.law.joined(other.law),
+            unscaled=np.concatenate([self.unscaled, other.unscaled]),
             **{name: np.concatenate([getattr(self, name), getattr(other, name)], axis=-1) for name in _OF_EACH},
         ).take(np.argsort(rods))
 
@@ -398,16 +409,28 @@ class _Looks(NamedTuple):
         return np.asarray(same)
 
     def may_show_other_structure(self, known: _Known) -> bool:
-        """Whether residuals about any spot differ by more than chance from those its structure was measured in."""
-        change = (self.misfit / known.misfit_then).tolist()
-        return bool(max(change) > STRUCTURE_CHANGE or min(change) < 1.0 / STRUCTURE_CHANGE)
+        """Whether residuals about any spot are larger than when structure was looked for, or smaller where there was.
 
-    def have_changed(self, known: _Known, fitted: Profiles) -> BoolArray:
-        """Whether (k,) things are no longer what they were when the law was measured."""
+        By more than chance.
+        """
+        change = self.misfit / known.misfit_then
+        other = change > STRUCTURE_CHANGE
+        if any(known.structure.tolist()):
+            other |= (known.structure > 0) & (change < 1.0 / STRUCTURE_CHANGE)
+        return any(other.tolist())
+
+    def have_changed(self, known: _Known, fitted: Profiles) -> BoolArray | None:
+        """Whether (k,) things are no longer what they were when the law was measured; None where none has changed."""
         change = self.misfit / known.misfit
-        changed = (change > LAW_CHANGE) | (change < 1.0 / LAW_CHANGE)
-        flatter = np.abs(fitted.parameters[FLATNESS] - known.flatness_then) > LAW_FLATNESS
-        return np.asarray(changed | (known.long.mask & flatter))
+        ratios = change.tolist()
+        changed = None
+        if max(ratios) > LAW_CHANGE or min(ratios) < 1.0 / LAW_CHANGE:
+            changed = (change > LAW_CHANGE) | (change < 1.0 / LAW_CHANGE)
+        if len(known.long):
+            flatter = np.abs(fitted.parameters[FLATNESS] - known.flatness_then) > LAW_FLATNESS
+            flatter &= known.long.mask
+            changed = flatter if changed is None else changed | flatter
+        return changed
 
 
 def _stepped(
@@ -479,17 +502,16 @@ def _stepped(
 def _solved(normal: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The first two columns (k, 10, 2) of the inverses of normal matrices (k, 10, 10), and the steps (10, k).
 
-    By Cholesky one by one, which costs half of one call for all; NaN where a matrix is not positive definite.
+    All NaN where one of the matrices is singular.
     """
-    solved = np.zeros((len(normal), 3, N_PARAMETERS))
-    solved[:, 0, 0] = solved[:, 1, 1] = 1.0
-    solved[:, 2] = gradient
-    for matrix, wanted in zip(normal, solved, strict=True):
-        # a symmetric matrix is its transpose, which is how LAPACK counts; the solution takes the place of what is asked
-        _, _, failed = dposv(matrix.T, wanted.T, overwrite_b=True)
-        if failed:
-            wanted.fill(np.nan)
-    return solved[:, :2].transpose(0, 2, 1), solved[:, 2].T
+    wanted = np.zeros((len(normal), N_PARAMETERS, 3))
+    wanted[:, 0, 0] = wanted[:, 1, 1] = 1.0
+    wanted[:, :, 2] = gradient
+    try:
+        solved: FloatArray = np.asarray(np.linalg.solve(normal, wanted), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        solved = np.full_like(wanted, np.nan)
+    return solved[:, :, :2], solved[:, :, 2].T
 
 
 def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:

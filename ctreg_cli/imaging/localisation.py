@@ -198,16 +198,22 @@ class Law:
     #: (k, 2, 2) covariance that a perfect fit has as well, px²
     least: FloatArray
 
-    def covariance(self, structure: FloatArray, factor: FloatArray | None = None) -> FloatArray:
-        """(k, 2, 2) px², for a ``structure`` of this variance (k,) about each spot.
+    def covariance(self, structure: FloatArray) -> FloatArray:
+        """(k, 2, 2) px², for a ``structure`` of this variance (k,) about each spot."""
+        return self.scaled(self.made_by(structure), 1.0)
+
+    def made_by(self, structure: FloatArray) -> FloatArray:
+        """(k, 2, 2) px²: what noise, and structure of these variances (k,), make of centres in sure windows."""
+        return centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
+
+    def scaled(self, covariance: FloatArray, factor: FloatArray | float) -> FloatArray:
+        """That ``covariance`` (k, 2, 2) and all else.
 
         ``factor`` (k,) is by how much worse, in variance, the centres are known now than where the law was measured.
         """
-        scale = self.faint if factor is None else self.faint * factor
-        covariance = centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
-        covariance *= scale[:, None, None]
-        covariance += self.least
-        return covariance
+        scaled: FloatArray = covariance * (self.faint * factor)[:, None, None]
+        scaled += self.least
+        return scaled
 
     def take(self, which: BoolArray | IntArray) -> Law:
         """Of some of the centres."""
