@@ -81,6 +81,7 @@ class Rows:
         """
         self._u, self._v, self._values, self._clipped, self.root_weights = u, v, values, clipped, root_weights
         self.long = long
+        self._long_at = None if long is None else np.flatnonzero(long)
         self._weighted_values = values * root_weights
         self._rows = np.empty((N_PARAMETERS + 1, *values.shape))
         self._fill_background()
@@ -129,17 +130,15 @@ class Rows:
         x *= l1
         eta += x
         q = xi * xi
-        slope = xi  # half of ∂q/∂ξ
         # all powers and logarithms of pixels are to base 2: exp2 costs less than exp
-        if self.long is not None:
-            at = np.flatnonzero(self.long)
+        at = self._long_at
+        if at is not None:
             square, gamma = q.take(at, axis=0), beta.take(at, axis=0)
             square += _TINY
             log2_along = np.log2(square)
             along = np.exp2(gamma * log2_along)
             gamma_along = gamma * along
-            slope, q[at], beta[at] = xi.copy(), along, LONG_BETA
-            slope[at] *= gamma_along / square
+            q[at], beta[at] = along, LONG_BETA
         q += eta * eta
         q += _TINY
         log2_q = np.log2(q)
@@ -153,12 +152,13 @@ class Rows:
         log2_q *= 0.5 * _LN2
         np.multiply(steepness, log2_q, out=rows[FLATNESS])
         steepness /= q  # ∂I/∂q, with the 2 of ∂q/∂ξ = 2ξ
-        if self.long is not None:
+        d_xi = np.multiply(steepness, xi, out=rows[0])
+        if at is not None:
+            d_xi[at] *= gamma_along / square  # ∂q/∂ξ = 2ξ γ (ξ²)^(γ − 1) there
             gamma_along *= log2_along
             gamma_along *= 0.5 * _LN2
             gamma_along *= steepness.take(at, axis=0)
             rows[FLATNESS, at] = gamma_along
-        d_xi = np.multiply(steepness, slope, out=rows[0])
         d_eta = np.multiply(steepness, eta, out=rows[1])
         np.multiply(d_xi, xi, out=rows[6])
         np.multiply(d_eta, xi, out=rows[7])

@@ -7,7 +7,6 @@ or without preamble and file meta, in any transfer syntax pydicom decodes. The g
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from sys import intern
@@ -77,18 +76,16 @@ def read_dicom(path: Path, source: str, head: bytes = b"", size: int | None = No
         A record a frame, in the file's order. A file that cannot be used is one record with a ``problem``.
     """
     info = SliceInfo(source=source)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what pydicom finds odd is either checked here or harmless
-        try:
-            return _read(path, source, head, path.stat().st_size if size is None else size)
-        except HeaderProblem as error:
-            return [ImageRecord(info=info, series=_LOST, problem=str(error))]
-        except RecursionError:
-            return [ImageRecord(info=info, series=_LOST, problem="its sequences are nested too deeply")]
-        # The one door for hostile files. Walking through damaged elements, pydicom raises struct.error, EOFError,
-        # OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, OverflowError and more.
-        except Exception:  # noqa: BLE001
-            return [ImageRecord(info=info, series=_LOST, problem="its header is damaged")]
+    try:
+        return _read(path, source, head, path.stat().st_size if size is None else size)
+    except HeaderProblem as error:
+        return [ImageRecord(info=info, series=_LOST, problem=str(error))]
+    except RecursionError:
+        return [ImageRecord(info=info, series=_LOST, problem="its sequences are nested too deeply")]
+    # The one door for hostile files. Walking through damaged elements, pydicom raises struct.error, EOFError,
+    # OSError, ValueError, TypeError, KeyError, AttributeError, NotImplementedError, OverflowError and more.
+    except Exception:  # noqa: BLE001
+        return [ImageRecord(info=info, series=_LOST, problem="its header is damaged")]
 
 
 def _read(path: Path, source: str, head: bytes, size: int) -> list[ImageRecord] | NotAnImage:

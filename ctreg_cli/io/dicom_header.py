@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+import warnings
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -187,7 +188,8 @@ class Elements:
             unknown = (
                 element.VR == "UN"
             )  # whoever passed it on did not know it, and left it in implicit VR (PS3.5 6.2.2)
-            value = convert_SQ(value, element.is_implicit_VR or unknown, element.is_little_endian or unknown)
+            with _no_remarks():
+                value = convert_SQ(value, element.is_implicit_VR or unknown, element.is_little_endian or unknown)
         return [Elements(_whole(item.elements()), self.little_endian) for item in value]
 
     def _one(self, keyword: str, value: bytes, code: str) -> int:
@@ -201,6 +203,14 @@ class Elements:
         if len(value) % size:
             raise problem(keyword, f"holds {len(value)} bytes, which is no whole number of values")
         return struct.unpack(f"{'<' if self.little_endian else '>'}{len(value) // size}{code}", value)
+
+
+@contextmanager
+def _no_remarks() -> Iterator[None]:
+    """What pydicom finds odd on its way is either checked here or harmless."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _text_decimals(value: bytes) -> tuple[float, ...] | None:
@@ -317,7 +327,8 @@ def read_header(file: BinaryIO, size: int) -> Header:
             raise HeaderProblem("the file is not DICOM (no DICM mark at byte 128)")
         notes.append("no preamble")
         file.seek(0)
-    meta = _file_meta(file)
+    with _no_remarks():
+        meta = _file_meta(file)
     implicit, little = _guess_encoding(file)
     named = meta.uid("TransferSyntaxUID")
     if named:
@@ -338,7 +349,8 @@ def read_header(file: BinaryIO, size: int) -> Header:
         deflated_from = file.tell()
         inflated, more = inflate(file, MAX_INFLATED_HEADER_BYTES)
         source, size, implicit = BytesIO(inflated), len(inflated), False
-    elements, pixels = _walk(source, implicit, little)
+    with _no_remarks():
+        elements, pixels = _walk(source, implicit, little)
     return Header(
         elements=Elements(elements, little),
         meta=meta,

@@ -84,11 +84,16 @@ def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> Pl
         return None  # the first element contradicts the meta
     elements: dict[int, RawDataElement] = {}
     for tag, vr, length, at in _elements(head, begin, implicit=implicit):
-        if tag in pixel_tags:
-            return PlainHeader(meta, elements, syntax, tag, vr, length, at)
-        if tag in wanted or tag == _CHARACTER_SET:
+        if tag in wanted:
             value = head[at : at + length]
-            if len(value) < length or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
+            if len(value) < length:
+                return None
+            elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
+        elif tag in pixel_tags:
+            return PlainHeader(meta, elements, syntax, tag, vr, length, at)
+        elif tag == _CHARACTER_SET:
+            value = head[at : at + length]
+            if len(value) < length or value.strip(b" \0") not in _CHARACTER_SETS:
                 return None
             elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
     return None
@@ -102,21 +107,21 @@ def _elements(head: bytes, at: int, *, implicit: bool) -> Iterator[tuple[int, st
     """
     short, long, explicit_element, implicit_element = _SHORT.get, _LONG.get, _explicit, _implicit
     while True:
-        vr = None
         if implicit:
             group, element, length = implicit_element(head, at)
-            at += 8
+            vr, at = None, at + 8
+            if length == _UNDEFINED or group == _DELIMITERS:
+                return
         else:
             group, element, code, length = explicit_element(head, at)
-            at += 8
-            vr = short(code)
-            if vr is None:
+            vr, at = short(code), at + 8
+            if vr is None:  # a delimiter has none at all
                 vr = long(code)
                 if vr is None:
                     return
                 (length,) = _long_length(head, at)
                 at += 4
-        if length == _UNDEFINED or group == _DELIMITERS:
-            return
+                if length == _UNDEFINED:
+                    return
         yield group << 16 | element, vr, length, at
         at += length
