@@ -67,12 +67,12 @@ AXES_MEMORY, MAX_CHANGE, LONG_DOUBT = 4.0, 1.5, 1.15
 MAX_MISFIT = 3.0
 #: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
 #: changes by this factor, or the flatness of a long spot by so much
-LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 32, 1.7, 0.15
+LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 64, 1.7, 0.15
 #: structure about a spot is looked for when that mean square changes by this factor: by chance in one slice of ten;
 #: a streak that widens a centre (:data:`~ctreg_cli.imaging.uncertainty.SURE_OF_STRUCTURE`) changes it by more
 STRUCTURE_CHANGE = 1.5
 #: everything is measured in full again after so many slices
-MAX_AGE = 64
+MAX_AGE = 256
 #: after a spot could not be learned, that is not tried for so many slices, twice as many each time
 FIRST_WAIT, MAX_WAIT = 1, 64
 

@@ -187,7 +187,7 @@ class NativePixels:
     def _read(self, dtype: np.dtype[Any], count: int, offset: int) -> NDArray[Any]:
         stored = np.empty(count, dtype=dtype)
         try:
-            with Path(self.path).open("rb") as file:
+            with Path(self.path).open("rb", buffering=0) as file:
                 file.seek(offset)
                 n_bytes = file.readinto(stored.data)
         except OSError as error:
