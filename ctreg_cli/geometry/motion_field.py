@@ -18,20 +18,34 @@ def motion_field(T: FloatArray, projection: Projection) -> FloatArray:
 
     Divide the rows by ``[s_x, s_y]`` for pixels. ``projection`` must come from :func:`project` at the same ``T``.
     """
-    q = projection.xy_mm - T[..., None, :2, 3]
-    q_z = np.broadcast_to(-T[..., None, 2, 3], q.shape[:-1])  # the crossing has z = 0
-    k = projection.slope
-    J = np.zeros((*q.shape[:-1], 2, 6))
-    J[..., 0, 0] = J[..., 1, 1] = 1.0
-    J[..., :, 2] = -k
-    # Ω × q = (Ω_y q_z − Ω_z q_y, Ω_z q_x − Ω_x q_z, Ω_x q_y − Ω_y q_x), seen through [I₂ | −k]
-    J[..., :, 3] = -k * q[..., 1, None]
-    J[..., 1, 3] -= q_z
-    J[..., :, 4] = k * q[..., 0, None]
-    J[..., 0, 4] += q_z
-    J[..., 0, 5] = -q[..., 1]
-    J[..., 1, 5] = q[..., 0]
-    return J
+    k, q = projection.slope, projection.xy_mm - T[..., None, :2, 3]
+    features = np.empty((*q.shape[:-1], N_FEATURES))
+    features[..., :2], features[..., 2:4] = k, q
+    np.multiply(k[..., :, None], q[..., None, :], out=features[..., 4:8].reshape(*q.shape[:-1], 2, 2))
+    features[..., 8], features[..., 9] = 1.0, -T[..., None, 2, 3]  # the crossing has z = 0
+    return np.asarray(features @ FIELD).reshape(*q.shape, 6)
+
+
+def _field() -> FloatArray:
+    """(10, 12) that makes ``[I | −k] [I | −[q]ₓ]`` (2, 6) of ``k_x k_y q_x q_y k_x·q k_y·q 1 q_z`` (q in the plane).
+
+    The motion field of a rod is linear in its slope k, in its crossing q seen from the model origin, and in the
+    products of the two: one product of matrices makes it of all rods.
+    """
+    k_x, k_y, q_x, q_y, kx_qx, kx_qy, ky_qx, ky_qy, one, q_z = range(N_FEATURES)
+    M = np.zeros((N_FEATURES, 2, 6))
+    M[one, 0, 0] = M[one, 1, 1] = 1.0
+    M[k_x, 0, 2] = M[k_y, 1, 2] = -1.0
+    M[kx_qy, 0, 3] = M[ky_qy, 1, 3] = M[q_z, 1, 3] = -1.0
+    M[kx_qx, 0, 4] = M[ky_qx, 1, 4] = M[q_z, 0, 4] = 1.0
+    M[q_y, 0, 5] = -1.0
+    M[q_x, 1, 5] = 1.0
+    return M.reshape(N_FEATURES, 12)
+
+
+#: features of a rod, see :func:`_field`
+N_FEATURES = 10
+FIELD = _field()
 
 
 def scaled_columns(J: FloatArray, size_mm: float) -> FloatArray:

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ctreg_cli.arrays import FloatArray
-from ctreg_cli.geometry.plucker import skew
 
 #: below this an angle is its sine; and the cosine below which half a turn is near
 _SMALL_SINE, _NEARLY_OPPOSITE = 1e-8, -0.9
+#: half an angle is never taken to be less: its sine is itself
+_TINY_RAD = 1e-30
 
 
 def make_pose(R: FloatArray, t: FloatArray) -> FloatArray:
@@ -33,22 +34,40 @@ def inverse(T: FloatArray) -> FloatArray:
 
 
 def exp_rotation(omega_rad: FloatArray) -> FloatArray:
-    """Rotations ``exp([Ω]ₓ)`` (..., 3, 3) of rotation vectors (..., 3); Rodrigues' formula, exact near zero too."""
+    """Rotations ``exp([Ω]ₓ)`` (..., 3, 3) of rotation vectors (..., 3); Rodrigues' formula, exact near zero too.
+
+    ``cos θ I + a [Ω]ₓ + b Ω Ωᵀ`` with ``a = sin θ / θ`` and ``b = (1 − cos θ) / θ²``.
+    """
     omega = np.asarray(omega_rad, dtype=np.float64)
-    angle2 = np.einsum("...i,...i->...", omega, omega)[..., None, None]
-    angle = np.sqrt(angle2)
-    # sinc form: no division by a small angle, no branch
-    a = np.sinc(angle / np.pi)
-    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    K = skew(omega)
-    rotation: FloatArray = np.eye(3) + a * K + b * (K @ K)
+    angle2 = (omega * omega).sum(axis=-1)
+    half = np.maximum(0.5 * np.sqrt(angle2), _TINY_RAD)  # no division by nothing, and no branch
+    sinc = np.sin(half) / half
+    b = 0.5 * sinc * sinc
+    rotation: FloatArray = omega[..., :, None] * omega[..., None, :]
+    rotation *= b[..., None, None]
+    axis = omega * (sinc * np.cos(half))[..., None]
+    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
+    rotation[..., 0, 1] -= z
+    rotation[..., 1, 0] += z
+    rotation[..., 0, 2] += y
+    rotation[..., 2, 0] -= y
+    rotation[..., 1, 2] -= x
+    rotation[..., 2, 1] += x
+    cosine = 1.0 - b * angle2
+    for i in range(3):
+        rotation[..., i, i] += cosine
     return rotation
 
 
 def update(T: FloatArray, twist: FloatArray) -> FloatArray:
     """Pose after the twist ``[V; Ω]`` (..., 6), mm and rad: ``R ← exp([Ω]ₓ) R``, ``t ← t + V`` (eq. 16 integrated)."""
     twist = np.asarray(twist, dtype=np.float64)
-    return make_pose(exp_rotation(twist[..., 3:]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., :3])
+    R = exp_rotation(twist[..., 3:]) @ T[..., :3, :3]
+    moved: FloatArray = np.empty((*R.shape[:-2], 4, 4))
+    moved[...] = T
+    moved[..., :3, :3] = R
+    moved[..., :3, 3] += twist[..., :3]
+    return moved
 
 
 def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field, scale_jacobian
-from ctreg_cli.geometry.projection import project
+from ctreg_cli.geometry.projection import Projection, project
 from ctreg_cli.rods import RodModel
 
 #: a pose farther than this many frame sizes from where it started has diverged
@@ -83,18 +83,18 @@ class Linearisation:
         b, n = self.residual_px.shape[:2]
         J = self.jacobian.reshape(b, 2 * n, 6)
         WJ = (self.weight @ self.jacobian).reshape(b, 2 * n, 6)
-        Jt = np.swapaxes(J, 1, 2)
-        gradient = np.einsum("bki,bk->bi", WJ, self.residual_px.reshape(b, 2 * n))
-        return Jt @ WJ, gradient
+        gradient = (self.residual_px.reshape(b, 1, 2 * n) @ WJ)[:, 0]
+        return J.transpose(0, 2, 1) @ WJ, gradient
 
 
 def invert_2x2(matrices: FloatArray) -> FloatArray:
     """Inverses of (..., 2, 2) matrices, in closed form."""
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
-    result = np.empty_like(matrices)
-    det = a * d - b * c
-    result[..., 0, 0], result[..., 0, 1] = d / det, -b / det
-    result[..., 1, 0], result[..., 1, 1] = -c / det, a / det
+    det = a * d
+    det -= b * c
+    result: FloatArray = np.empty_like(matrices)
+    result[..., 0, 0], result[..., 0, 1], result[..., 1, 0], result[..., 1, 1] = d, -b, -c, a
+    result /= det[..., None, None]
     return result
 
 
@@ -104,10 +104,12 @@ def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, hal
     The spot is the mean of what metal the slab holds. Where a length of the slab's height is empty, its middle lies
     half that length off the mid-plane, and the spot as much times the slope.
     """
-    rise = 1 / np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of z per mm of rod
-    below = np.clip(half_slab_mm - lambda_mm * rise, 0, 2 * half_slab_mm)
-    above = np.clip(half_slab_mm - (model.lengths - lambda_mm) * rise, 0, 2 * half_slab_mm)
-    result: FloatArray = 0.5 * (below + above)
+    rise = 1 / np.sqrt(1 + (slope * slope).sum(axis=-1))  # mm of z per mm of rod
+    result: FloatArray = np.zeros_like(rise)
+    for to_end in (lambda_mm, model.lengths - lambda_mm):
+        empty = half_slab_mm - to_end * rise
+        result += np.minimum(np.maximum(empty, 0), 2 * half_slab_mm)
+    result *= 0.5
     return result
 
 
@@ -149,14 +151,18 @@ def merged_covariance(
         The covariances, or None where there are none.
     """
     lost = ~matched & (lambda_mm >= 0) & (lambda_mm <= model.lengths)
-    if not lost.any():
+    rods = np.flatnonzero(lost.any(axis=0))
+    if not len(rods):
         return None
-    gap = np.where(lost[..., None], xy_mm, np.inf)[:, None] - np.where(matched[..., None], xy_mm, 0.0)[:, :, None]
-    with np.errstate(invalid="ignore"):
-        distance2 = (gap * gap).sum(axis=-1)  # (b, matched, lost)
-    near = np.nonzero((distance2 < resolved_mm**2) & matched[..., None])
-    if len(near[0]) == 0:
+    gap = xy_mm[:, None, rods] - xy_mm[:, :, None]  # (b, matched, lost)
+    distance2 = gap[..., 0] * gap[..., 0]
+    distance2 += gap[..., 1] * gap[..., 1]
+    is_near = distance2 < resolved_mm**2
+    is_near &= matched[..., None]
+    is_near &= lost[:, None, rods]
+    if not is_near.any():
         return None
+    near = np.nonzero(is_near)
     g = gap[near]
     share = np.clip(2 - 2 * np.sqrt(distance2[near]) / resolved_mm, 0, 1)
     result = np.zeros((*matched.shape, 2, 2))
@@ -170,26 +176,43 @@ def linearise(model: RodModel, T: FloatArray, observations: Observations) -> Lin
     projection = project(T, model.starts, model.directions)
     scale = o.mm_per_px[..., None, :]
     predicted = projection.xy_mm / scale
-    used = o.matched & np.isfinite(predicted).all(axis=-1)
-    slope = np.where(used[..., None], projection.slope, 0.0)
-    shift = None
+    used, slope = o.matched, projection.slope
+    cut = np.isfinite(predicted[..., 0])  # not where a rod lies in the slice
+    all_cut = bool(cut.all())
+    if not all_cut:
+        used = used & cut
+        slope = np.where(used[..., None], slope, 0.0)
+    W = _weight(model, projection, slope, used, o)
+    r = np.where(used[..., None], o.uv_px - predicted, 0.0)
+    J = motion_field(T, projection)
+    J /= scale[..., None]
+    if not all_cut:
+        J[~cut] = 0.0
+    chi2 = ((W @ r[..., None])[..., 0] * r).sum(axis=(1, 2))
+    if not all_cut:
+        chi2[(used != o.matched).any(axis=1)] = np.inf
+    return Linearisation(
+        residual_px=r, weight=W, jacobian=J, chi2=chi2, lambda_mm=projection.lambda_mm, predicted_px=predicted
+    )
+
+
+def _weight(model: RodModel, projection: Projection, slope: FloatArray, used: BoolArray, o: Observations) -> FloatArray:
+    """Weights (b, n, 2, 2) of the ``used`` (b, n) spots, zero elsewhere; ``slope`` (b, n, 2) is finite."""
+    scale = o.mm_per_px[..., None, :]
+    covariance, shift = o.covariance_px, None
     if o.half_slab_mm > 0:
         shift = rod_end_shift(model, slope, np.where(used, projection.lambda_mm, 0.5 * model.lengths), o.half_slab_mm)
-    covariance = spot_covariance(model, slope, o.covariance_px, o.mm_per_px, shift)
+        if not shift.any():
+            shift = None
+    if shift is not None or model.tolerances.any():
+        covariance = spot_covariance(model, slope, covariance, o.mm_per_px, shift)
     if o.resolved_mm > 0:
         blur = merged_covariance(model, projection.xy_mm, projection.lambda_mm, used, o.resolved_mm)
         if blur is not None:
             covariance = covariance + blur / (scale[..., :, None] * scale[..., None, :])
     W = invert_2x2(covariance)
-    W = np.where(used[..., None, None], W, 0.0)
-    r = np.where(used[..., None], o.uv_px - predicted, 0.0)
-    J = motion_field(T, projection) / scale[..., None]
-    J = np.where(np.isfinite(J), J, 0.0)
-    chi2 = np.einsum("bni,bnij,bnj->b", r, W, r)
-    chi2 = np.where((used == o.matched).all(axis=1), chi2, np.inf)
-    return Linearisation(
-        residual_px=r, weight=W, jacobian=J, chi2=chi2, lambda_mm=projection.lambda_mm, predicted_px=predicted
-    )
+    W[~used] = 0.0
+    return W
 
 
 def refine(
@@ -218,22 +241,25 @@ def refine(
         part = here if len(active) == len(T) else here.subset(active)
         seen = observations if len(active) == len(T) else observations.subset(active)
         H, g = part.normal_equations()
-        H = H * (unit[:, None] * unit)
-        diagonal = np.array(np.einsum("bii->bi", H))
-        floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
-        np.einsum("bii->bi", H)[...] += damping[active, None] * diagonal + floor
-        step = np.linalg.solve(H, (g * unit)[..., None])[..., 0] * unit
-        turn = np.sqrt((step[:, 3:] ** 2).sum(axis=1))
-        step *= np.minimum(1, _MAX_TURN_RAD / np.maximum(turn, 1e-300))[:, None]
+        H *= unit[:, None] * unit
+        diagonal = H.reshape(-1, 36)[:, ::7]  # a view
+        damped = diagonal * (1.0 + damping[active, None])
+        damped += 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+        diagonal[...] = damped
+        step = np.linalg.solve(H, (g * unit)[..., None])[..., 0]
+        step *= unit
+        turn2 = (step[:, 3:] * step[:, 3:]).sum(axis=1)
+        if turn2.max() > _MAX_TURN_RAD**2:
+            step *= np.minimum(1, _MAX_TURN_RAD / np.sqrt(np.maximum(turn2, 1e-300)))[:, None]
         T_new = poses.update(T[active], step)
         there = linearise(model, T_new, seen)
         better = there.chi2 <= part.chi2
         damping[active] = np.where(better, damping[active] * 0.1, np.minimum(damping[active] * 10, 1e8))
         size = np.abs(step / unit).max(axis=1) / model.size_mm
-        T[active[better]] = T_new[better]
         if len(active) == len(T) and better.all():
-            here = there
+            T, here = T_new, there
         else:
+            T[active[better]] = T_new[better]
             here.take(active[better], there, better)
         active = active[size > step_tolerance]
     return T, here, steps

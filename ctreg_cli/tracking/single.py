@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dposv, dpotrf
 
 from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.motion_field import FIELD, N_FEATURES
 from ctreg_cli.geometry.projection import MIN_DIRECTION_Z
 from ctreg_cli.rods import RodModel
 
@@ -66,8 +67,8 @@ def lines_of(model: RodModel, rods: IntArray) -> FloatArray:
 def cross(T: FloatArray, columns: FloatArray) -> Crossing:
     """:func:`~ctreg_cli.geometry.projection.project` and the motion field, at once.
 
-    The motion field of a rod (Doignon et al. 2008, eq. 12) is linear in its slope k, in its crossing q seen from the
-    model origin, and in the products of the two: one product of matrices makes it of all rods.
+    The motion field (Doignon et al. 2008, eq. 12) of all rods is made by one product of matrices, see
+    :data:`~ctreg_cli.geometry.motion_field.FIELD`.
 
     Args:
         T: (4, 4) pose, mm.
@@ -78,7 +79,7 @@ def cross(T: FloatArray, columns: FloatArray) -> Crossing:
     a_z, d_z = placed[2, :n], placed[2, n:]
     if min(map(abs, d_z.tolist())) <= MIN_DIRECTION_Z:
         d_z = np.where(np.abs(d_z) > MIN_DIRECTION_Z, d_z, np.nan)
-    features = np.empty((_FEATURES, n))
+    features = np.empty((N_FEATURES, n))
     slope = np.divide(placed[:2, n:], d_z, out=features[:2])
     xy = placed[:2, :n] - a_z * slope
     q = np.subtract(xy, T[:2, 3:], out=features[2:4])
@@ -90,21 +91,8 @@ def cross(T: FloatArray, columns: FloatArray) -> Crossing:
         lambda_mm=a_z * mm_per_dz,
         slope=slope.T,
         mm_per_height=np.abs(mm_per_dz),
-        jacobian=features.T.dot(_FIELD).reshape(n, 2, 6),
+        jacobian=features.T.dot(FIELD).reshape(n, 2, 6),
     )
-
-
-def _field() -> FloatArray:
-    """(10, 12) that makes ``[I | −k] [I | −[q]ₓ]`` (2, 6) of ``k_x k_y q_x q_y k_x·q k_y·q 1 q_z`` (q in the plane)."""
-    k_x, k_y, q_x, q_y, kx_qx, kx_qy, ky_qx, ky_qy, one, q_z = range(_FEATURES)
-    M = np.zeros((_FEATURES, 2, 6))
-    M[one, 0, 0] = M[one, 1, 1] = 1.0
-    M[k_x, 0, 2] = M[k_y, 1, 2] = -1.0
-    M[kx_qy, 0, 3] = M[ky_qy, 1, 3] = M[q_z, 1, 3] = -1.0
-    M[kx_qx, 0, 4] = M[ky_qx, 1, 4] = M[q_z, 0, 4] = 1.0
-    M[q_y, 0, 5] = -1.0
-    M[q_x, 1, 5] = 1.0
-    return M.reshape(_FEATURES, 12)
 
 
 def updated(T: FloatArray, twist: FloatArray) -> FloatArray:
@@ -261,9 +249,6 @@ def _lever() -> FloatArray:
     return np.stack([shifted(unit)[:3] - _EYE6[:3] for unit in np.eye(3)]).reshape(3, 18)
 
 
-#: columns of the table that the motion field is made of
-_FEATURES = 10
-_FIELD = _field()
 #: cosine below which half a turn is near
 _NEARLY_OPPOSITE = -0.99
 #: below this an angle's sine is the angle, to double precision
