@@ -264,7 +264,7 @@ def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | 
     after = list(results)
     sure = [i for i, result in enumerate(results) if result.status == "ok"]
     starts = [n for n, i in enumerate(sure) if results[i].begins or not n]
-    for first, end in zip(starts, [*starts[1:], len(sure)], strict=True):
+    for first, end in pairwise([*starts, len(sure)]):
         places = sure[first:end]
         motion = [_timed_pose(results[i], model) for i in places]
         if any(m.time_s < before.time_s for before, m in pairwise(motion)):
