@@ -228,6 +228,17 @@ def test_mount_is_taken_in_patient_axes() -> None:
     assert without.best is None or poses.rotation_angle(without.best.T_slice_model[:3, :3] @ R.T) > np.radians(10)
 
 
+@pytest.mark.parametrize("seed", [91, 126, 153])
+def test_what_makes_a_slice_ambiguous_is_named(seed: int) -> None:
+    """Also where the best pose's sd is widened until it reaches the rival."""
+    rng = np.random.default_rng([891, seed])
+    frame = random_frame(rng, int(rng.integers(5, 8)))
+    world = some_scene(rng, frame, sd_px=float(rng.choice([0.3, 0.6, 1.0])), least=5)
+    result = register(Spots.from_points(world.uv_px, world.sd_px), model_of(frame), scale=scale_of(world))
+    assert (result.status, result.reason) == ("ambiguous", "rival_pose")
+    assert len(result.candidates) > 1
+
+
 def test_a_rod_model_of_parallel_rods_gives_no_pose() -> None:
     rng = np.random.default_rng(814)
     frame = random_frame(rng, 7)
