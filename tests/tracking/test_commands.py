@@ -92,7 +92,7 @@ def test_smoothed_motion_is_nearer_to_the_truth(moving: tuple[Path, Sequence], t
     assert {row.cells["method"] for row in read_results(tmp_path / "b.csv")} == {"smoothed"}
 
 
-@pytest.mark.parametrize("sure", [0, 1])
+@pytest.mark.parametrize("sure", [0, 1, 9])
 def test_a_sequence_without_a_motion_is_smoothed_to_itself(
     moving: tuple[Path, Sequence], tmp_path: Path, sure: int
 ) -> None:
@@ -102,7 +102,7 @@ def test_a_sequence_without_a_motion_is_smoothed_to_itself(
     spots.write_text("\n".join([header, *dict.fromkeys(kept)]) + "\n")
     a, b = tmp_path / "a.csv", tmp_path / "b.csv"
     ctreg("track", str(spots), "-m", CUBE, "-o", str(a), "--smooth", str(b), "-q", code=0 if sure else 1)
-    columns = ["slice", "status", "reason", "tx_mm", "qw"]
+    columns = ["slice", "status", "reason", "tx_mm", "qw", "sd_tx_mm"]
     assert [[r[c] for c in columns] for r in table(b)] == [[r[c] for c in columns] for r in table(a)]
     assert sum(r["status"] == "ok" for r in table(b)) == sure
 
