@@ -329,3 +329,20 @@ def test_an_exact_twin_is_never_overlooked(seed: int) -> None:
     assert result.status == "ambiguous", (seed, result.reason)
     error = [error_of(c.T_slice_model, world) for c in result.candidates]
     assert min(np.sqrt(e @ np.linalg.pinv(world.bound) @ e) for e in error) < 6, seed
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 9, 31, 50])
+def test_a_frame_that_is_its_own_mirror_image_has_a_twin_seen_from_below(seed: int) -> None:
+    """Three panels of a V each: no turn maps them onto themselves, but a slice has no handedness."""
+    rng = np.random.default_rng([893, seed])
+    ends = [(15, -13.5, 15, 0), (15, 0, 15, 13.5), (13.5, 15, 0, 15), (0, 15, -13.5, 15), (-15, 13.5, -15, 0)]
+    ends += [(-15, 0, -15, -13.5)]
+    up = np.array([1, -1, 1, -1, 1, -1]) * 16.5
+    top, bottom = np.array(ends, dtype=float)[:, :2], np.array(ends, dtype=float)[:, 2:]
+    frame = OracleFrame(np.column_stack([top, up]), np.column_stack([bottom, -up]))
+    world = some_scene(rng, frame, sd_px=0.1, least=6)
+    result = registered(world, model_of(frame))
+    assert (result.status, result.reason) == ("ambiguous", "rival_pose")
+    distances = [np.linalg.norm(error_of(c.T_slice_model, world)[3:]) for c in result.candidates]
+    assert min(distances) < 0.1
+    assert max(distances) > 1
