@@ -28,7 +28,7 @@ from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.motion import StillAxes
 from ctreg_cli.tracking.servo import Desired, view
-from ctreg_cli.tracking.smoother import TimedPose, lasting_covariance, smooth
+from ctreg_cli.tracking.smoother import LEAST_SLICES, TimedPose, lasting_covariance, smooth
 from ctreg_cli.tracking.tracker import Tracked, Tracker, Velocity
 
 
@@ -254,7 +254,8 @@ def track_slice(
 def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | None = None) -> list[FrameResult]:
     """The tracked motion in hindsight: each ``ok`` pose becomes the one most probable given all slices of its motion.
 
-    A motion ends where the frame jumped, or a new series begins; slices without a sure pose stay without one.
+    A motion ends where the frame jumped, or a new series begins; slices without a sure pose stay without one. A motion
+    of a few slices says too little of itself: its poses stay as they are.
 
     Args:
         results: of :func:`track`, all of them.
@@ -264,8 +265,10 @@ def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | 
     after = list(results)
     sure = [i for i, result in enumerate(results) if result.status == "ok"]
     starts = [n for n, i in enumerate(sure) if results[i].begins or not n]
-    for first, end in zip(starts, [*starts[1:], len(sure)], strict=True):
+    for first, end in pairwise([*starts, len(sure)]):
         places = sure[first:end]
+        if len(places) < LEAST_SLICES:
+            continue
         motion = [_timed_pose(results[i], model) for i in places]
         if any(m.time_s < before.time_s for before, m in pairwise(motion)):
             continue

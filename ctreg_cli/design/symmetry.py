@@ -18,7 +18,7 @@ MIN_ANGLE_RAD = np.radians(5.0)
 class Symmetry:
     """A proper rigid motion of the model frame that takes every bounded rod to a rod, either way round."""
 
-    #: (4, 4) model → model, mm
+    #: (4, 4) model → model, mm; improper for a mirror image
     transform: FloatArray
     angle_deg: float
     #: (3,) unit axis of the turn, model axes
@@ -29,14 +29,18 @@ class Symmetry:
     deviation_mm: float
 
 
-def symmetries(model: RodModel, *, within_mm: float) -> tuple[Symmetry, ...]:
+def symmetries(model: RodModel, *, within_mm: float, mirrored: bool = False) -> tuple[Symmetry, ...]:
     """All motions, but for the identity, that map the rods onto rods to ``within_mm``, the closest first.
+
+    With ``mirrored`` those that do so to the frame's mirror image: ``transform`` then holds the mirror too.
 
     A pair of rods on different lines fixes a motion once its image is chosen, so every ordered pair is tried as its
     image, each rod both ways round; what maps the pair is then checked on all rods.
     """
     n = len(model)
     ends = np.stack([model.starts, model.ends], axis=1)  # (n, 2, 3)
+    mirror = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
+    source = _move(mirror, ends.reshape(-1, 3)).reshape(n, 2, 3)
     a, b = _reference_pair(model)
     i, j = (index.ravel() for index in np.nonzero(~np.eye(n, dtype=bool)))
     pairs = np.concatenate(
@@ -46,7 +50,7 @@ def symmetries(model: RodModel, *, within_mm: float) -> tuple[Symmetry, ...]:
             for flip_j in (1, -1)
         ]
     )  # (4 n (n − 1), 4, 3)
-    reference = np.concatenate([ends[a], ends[b]])
+    reference = np.concatenate([source[a], source[b]])
     # two rods fix the rest loosely where they are short or close: allow for it here, and measure properly below
     slack_mm = 2 * within_mm
     fitted = _fit(reference, pairs)
@@ -54,17 +58,17 @@ def symmetries(model: RodModel, *, within_mm: float) -> tuple[Symmetry, ...]:
 
     found: dict[tuple[int, ...], Symmetry] = {}
     for T in fitted[close]:
-        image, flipped = _images(_move(T, ends.reshape(-1, 3)).reshape(n, 2, 3), ends)
+        image, flipped = _images(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3), ends)
         key = (*image.tolist(), *flipped.tolist())
         if key in found or len(set(image.tolist())) < n:
             continue
         target = np.where(flipped[:, None, None], ends[image][:, ::-1], ends[image])
-        best = _fit(ends.reshape(-1, 3), target.reshape(1, -1, 3))[0]
-        deviation = float(np.linalg.norm(_move(best, ends.reshape(-1, 3)) - target.reshape(-1, 3), axis=-1).max())
+        best = _fit(source.reshape(-1, 3), target.reshape(1, -1, 3))[0]
+        deviation = float(np.linalg.norm(_move(best, source.reshape(-1, 3)) - target.reshape(-1, 3), axis=-1).max())
         angle = float(rotation_angle(best[:3, :3]))
-        if deviation <= within_mm and angle > MIN_ANGLE_RAD:
+        if deviation <= within_mm and (mirrored or angle > MIN_ANGLE_RAD):
             found[key] = Symmetry(
-                transform=best,
+                transform=best @ mirror,
                 angle_deg=float(np.degrees(angle)),
                 axis=_axis(best[:3, :3]),
                 image=image,

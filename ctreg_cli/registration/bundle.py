@@ -120,7 +120,8 @@ def _own_poses(
             continue
         own = scale or item.info.scale
         if own is None:
-            raise MissingScaleError(f"{item.info.source}: no pixel scale in the input; give one in mm per pixel")
+            source = item.info.source or "spots"
+            raise MissingScaleError(f"{source}: no pixel scale in the input; give one in mm per pixel")
         verdict = register(
             item.spots,
             model,

@@ -45,6 +45,8 @@ from ctreg_cli.rods import RodModel
 _GATE2 = 20.0
 #: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
 _WIDEST_GATE = 0.2
+#: and no noise carries a spot farther beyond the end of its rod than this share of the rod's length
+_MOST_BEYOND_END = 0.5
 #: matches up to which nothing checks the fit but the odds
 LEAST_CHECKED = 4
 #: how many triples of any five rods or more are tried
@@ -541,12 +543,14 @@ def visibility(
     """Which rods *may* leave a spot, and which *must* (..., n).
 
     Between the two lie rods cut near an end, where only part of the slab holds metal, or as near to it as the pose is
-    known (``sd_mm`` along the rod); and rods outside the image.
+    known (``sd_mm`` along the rod); and rods outside the image. A rod that lies nearly in the slice would be cut
+    anywhere with a little noise: it leaves a line, not a spot that says where, and half its length is the most.
     """
     noise = _noise_mm(model, scene)
     with np.errstate(invalid="ignore"):
         per_mm = np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of rod per mm of slab
-        slack = scene.half_slab_mm * per_mm + 4 * noise * per_mm + 0.01 * model.size_mm
+        near_end = np.minimum(scene.half_slab_mm * per_mm + 4 * noise * per_mm, _MOST_BEYOND_END * model.lengths)
+        slack = near_end + 0.01 * model.size_mm
         may = (lambda_mm >= -slack) & (lambda_mm <= model.lengths + slack)
         inner = slack + sd_mm
         must = (lambda_mm >= inner) & (lambda_mm <= model.lengths - inner)

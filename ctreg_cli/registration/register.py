@@ -308,11 +308,11 @@ def decide(
         return refused("unprotected")
     warnings.extend(fit_warnings(model, spots, best))
     if rivals:
-        chosen = _distinct_poses([best, *rivals])
+        # all of them, also what the widened covariance would hold by now: they are why the slice is refused
         return Registration(
             status="ambiguous",
             reason="rival_pose",
-            candidates=tuple(chosen),
+            candidates=(best, *rivals),
             n_spots=len(spots),
             warnings=tuple(warnings),
         )

@@ -1,7 +1,8 @@
 """A frame that is nearly its own image has a second pose in every slice: what its symmetries make of a match.
 
 The search finds most twins by itself, but noise can take every root of the triples it starts from. These are worked out
-from the frame.
+from the frame. So are those of a frame that is its own mirror image: a slice has no handedness, and a mirrored frame
+seen from the other side leaves the same spots.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ _MOST_RODS = 24
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Twin:
-    """A motion that maps the frame onto itself, nearly, and but for one rod perhaps."""
+    """A motion that maps the frame onto itself (or its mirror image), nearly, and but for one rod perhaps."""
 
-    #: (4, 4) model → model, mm
+    #: (4, 4) model → model, mm; improper for a mirror image
     transform: FloatArray
     #: (n,) rod ``i`` comes to lie on rod ``image[i]``; −1 for the odd one
     image: IntArray
 
 
-@lru_cache(maxsize=16)
-def twins(model: RodModel) -> tuple[Twin, ...]:
-    """All of a model; cached, since it is a value that never changes.
+@lru_cache(maxsize=32)
+def twins(model: RodModel, *, mirrored: bool = False) -> tuple[Twin, ...]:
+    """All of a model, or all of its mirror image; cached, since it is a value that never changes.
 
     A frame of a few rods is made unlike its own image by one of them. In a slice where that one leaves no spot, or a
     false one, the frame has two poses all the same.
@@ -44,11 +45,12 @@ def twins(model: RodModel) -> tuple[Twin, ...]:
     if len(model) > _MOST_RODS:
         return ()
     within_mm = _SYMMETRIC_WITHIN * model.size_mm
-    found = [Twin(transform=s.transform, image=s.image) for s in symmetries(model, within_mm=within_mm)]
+    alike = symmetries(model, within_mm=within_mm, mirrored=mirrored)
+    found = [Twin(transform=s.transform, image=s.image) for s in alike]
     everyone = np.arange(len(model))
     for odd in range(len(model)) if len(model) > _LEAST_SYMMETRIC else ():
         rest = np.delete(everyone, odd)
-        for s in symmetries(model.subset(rest.tolist()), within_mm=within_mm):
+        for s in symmetries(model.subset(rest.tolist()), within_mm=within_mm, mirrored=mirrored):
             image = np.full(len(model), -1, dtype=np.intp)
             image[rest] = rest[s.image]
             if not any((twin.image[rest] == image[rest]).all() for twin in found):
@@ -60,12 +62,15 @@ def with_twins(model: RodModel, scene: Scene, matches: Matches, least_matches: i
     """``matches`` and, for the best of them, what each twin of the frame makes of it.
 
     A motion S that takes rod i to rod ``image[i]`` makes of the pose T the pose T S; the spot of ``image[i]`` is then
-    that of i. The odd rod, if any, then asks for a spot where the pose puts it.
+    that of i. The odd rod, if any, then asks for a spot where the pose puts it. Of a mirror image M it makes Z T M, Z
+    the mirror in the slice, which leaves the spots where they are.
     """
-    symmetric = twins(model)
+    proper, mirrored = twins(model), twins(model, mirrored=True)
+    symmetric = (*proper, *mirrored)
     if not symmetric:
         return matches
     T = matches.T[0] @ np.stack([twin.transform for twin in symmetric])
+    T[len(proper) :] = np.diag([1.0, 1.0, -1.0, 1.0]) @ T[len(proper) :]
     own = np.append(matches.spot_of_rod[0], -1)
     spot_of_rod = np.stack([own[twin.image] for twin in symmetric])
     enough = (spot_of_rod >= 0).sum(axis=1) >= max(least_matches, _LEAST_DETERMINED)

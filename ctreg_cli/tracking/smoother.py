@@ -24,6 +24,9 @@ from ctreg_cli.tracking.servo import Desired, View
 ROUNDS, LEARN_FROM = 30, 400
 #: rounds after which the smoother is linearised about its own result
 _RELINEARISE = (1, 3, 6)
+#: fewer slices do not tell how a motion changes: a drift learnt from them is too small more often than not, and with it
+#: the covariance (three to six slices of a breath: NEES/6 of 2 to 9)
+LEAST_SLICES = 10
 #: what is believed of the drift beforehand counts as so many slices, and is so many times the tracker's first guess
 PRIOR_SLICES, PRIOR_SHARE = 1.0, 0.02
 #: shorter intervals are the same moment, s
@@ -46,7 +49,8 @@ class TimedPose:
 def smooth(measured: Sequence[TimedPose]) -> list[TimedPose]:
     """The most probable motion through measured poses of one unbroken motion, in the order of time.
 
-    A pose that repeats the one before to the last digit is the same slice twice, and counts once.
+    A pose that repeats the one before to the last digit is the same slice twice, and counts once. The covariances are
+    true from :data:`LEAST_SLICES` poses on.
 
     Returns:
         Pose and velocity at the same times, with their covariances. One pose alone comes back as it is.

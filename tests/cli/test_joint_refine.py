@@ -62,6 +62,8 @@ def test_joint_without_places_is_refused_in_one_sentence(scanned: tuple[Path, Pa
     table.write_text("\n".join(lines) + "\n", encoding="utf-8")
     result = run_ctreg("pose", table, "-m", frame, "--joint", "-o", tmp_path / "p.csv", code=2)
     assert "ImagePositionPatient" in result.stderr
+    table.write_text("\n".join(line.replace(",x,", ",,") for line in lines) + "\n", encoding="utf-8")
+    assert "spots: no place" in run_ctreg("pose", table, "-m", frame, "--joint", code=2).stderr
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "p.csv").exists()
 

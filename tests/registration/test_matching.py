@@ -10,7 +10,7 @@ import pytest
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.labelled import register_labelled
-from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, doubt, plan, search, weigh
+from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, doubt, plan, search, visibility, weigh
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
@@ -45,6 +45,21 @@ def test_the_true_labels_are_among_the_matches(sd_px: float) -> None:
         matches = [{(rod, int(spot)) for rod, spot in enumerate(row) if spot >= 0} for row in found.spot_of_rod]
         # noise may leave one of the true spots outside its gate
         assert any(len(true & match) >= len(true) - 1 for match in matches), seed
+
+
+def test_no_slope_carries_a_spot_more_than_half_a_rod_beyond_its_end() -> None:
+    rng = np.random.default_rng(863)
+    model = model_of(random_frame(rng, 9), tolerance_mm=0.3)
+    spots = Spots.from_points(rng.uniform(100, 200, (12, 2)), 0.5)
+    scene = make_scene(spots, model, HALF_MM, thickness_mm=5.0, options=RegistrationOptions())
+    slope = rng.normal(size=(200, 9, 2)) * np.geomspace(0.01, 1e6, 200)[:, None, None]
+    lambda_mm = rng.uniform(-2, 3, (200, 9)) * model.lengths
+    may, must = visibility(model, scene, lambda_mm, slope, np.zeros((200, 9, 2)))
+    beyond = np.maximum(-lambda_mm, lambda_mm - model.lengths) / model.lengths
+    assert not may[beyond > 0.55].any()
+    assert may[beyond < 0].all()
+    assert not (must & ~may).any()
+    assert not must[100:].any()
 
 
 def test_of_two_frames_in_a_slice_none_is_picked_at_random() -> None:

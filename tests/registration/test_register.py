@@ -228,6 +228,49 @@ def test_mount_is_taken_in_patient_axes() -> None:
     assert without.best is None or poses.rotation_angle(without.best.T_slice_model[:3, :3] @ R.T) > np.radians(10)
 
 
+def test_a_rod_that_lies_in_the_slice_is_no_match() -> None:
+    """It would be cut anywhere, with a little noise: here r2, 16 mm long, 500 mm beyond its end, and all was ``ok``."""
+    rods = np.array(
+        [
+            [-1.42, 7.46, 13.11, 11.16, 5.18, -1.57],
+            [0.16, -15.29, -4.61, -6.32, 10.09, 0.84],
+            [11.26, 0.47, -5.09, 0.83, -10.59, -0.16],
+            [-2.22, 10.42, 12.25, 19.13, 3.47, -15.01],
+            [-3.15, 3.98, 13.65, 10.67, -12.38, -4.3],
+            [-6.94, 13.47, 5.0, 18.49, -10.95, 9.88],
+            [8.48, 0.3, 1.77, -25.65, -9.97, 2.56],
+            [-0.68, -13.95, -2.34, 4.16, 6.66, 4.03],
+        ]
+    )
+    spots_px = np.array(
+        [
+            [266.04, 240.32],
+            [311.06, 263.1],
+            [206.02, 255.79],
+            [202.0, 249.74],
+            [243.29, 297.63],
+            [295.5, 257.63],
+            [308.84, 264.79],
+            [298.14, 263.32],
+            [266.66, 230.7],
+        ]
+    )
+    model = model_of(OracleFrame(rods[:, :3], rods[:, 3:]), tolerance_mm=0.09)
+    result = register(Spots.from_points(spots_px, 0.2), model, scale=Scale(s_x=0.15227, s_y=0.15227))
+    assert result.status == "no_pose"
+
+
+@pytest.mark.parametrize("seed", [91, 126, 153])
+def test_what_makes_a_slice_ambiguous_is_named(seed: int) -> None:
+    """Also where the best pose's sd is widened until it reaches the rival."""
+    rng = np.random.default_rng([891, seed])
+    frame = random_frame(rng, int(rng.integers(5, 8)))
+    world = some_scene(rng, frame, sd_px=float(rng.choice([0.3, 0.6, 1.0])), least=5)
+    result = register(Spots.from_points(world.uv_px, world.sd_px), model_of(frame), scale=scale_of(world))
+    assert (result.status, result.reason) == ("ambiguous", "rival_pose")
+    assert len(result.candidates) > 1
+
+
 def test_a_rod_model_of_parallel_rods_gives_no_pose() -> None:
     rng = np.random.default_rng(814)
     frame = random_frame(rng, 7)
@@ -286,3 +329,20 @@ def test_an_exact_twin_is_never_overlooked(seed: int) -> None:
     assert result.status == "ambiguous", (seed, result.reason)
     error = [error_of(c.T_slice_model, world) for c in result.candidates]
     assert min(np.sqrt(e @ np.linalg.pinv(world.bound) @ e) for e in error) < 6, seed
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 9, 31, 50])
+def test_a_frame_that_is_its_own_mirror_image_has_a_twin_seen_from_below(seed: int) -> None:
+    """Three panels of a V each: no turn maps them onto themselves, but a slice has no handedness."""
+    rng = np.random.default_rng([893, seed])
+    ends = [(15, -13.5, 15, 0), (15, 0, 15, 13.5), (13.5, 15, 0, 15), (0, 15, -13.5, 15), (-15, 13.5, -15, 0)]
+    ends += [(-15, 0, -15, -13.5)]
+    up = np.array([1, -1, 1, -1, 1, -1]) * 16.5
+    top, bottom = np.array(ends, dtype=float)[:, :2], np.array(ends, dtype=float)[:, 2:]
+    frame = OracleFrame(np.column_stack([top, up]), np.column_stack([bottom, -up]))
+    world = some_scene(rng, frame, sd_px=0.1, least=6)
+    result = registered(world, model_of(frame))
+    assert (result.status, result.reason) == ("ambiguous", "rival_pose")
+    distances = [np.linalg.norm(error_of(c.T_slice_model, world)[3:]) for c in result.candidates]
+    assert min(distances) < 0.1
+    assert max(distances) > 1

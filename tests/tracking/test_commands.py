@@ -92,6 +92,21 @@ def test_smoothed_motion_is_nearer_to_the_truth(moving: tuple[Path, Sequence], t
     assert {row.cells["method"] for row in read_results(tmp_path / "b.csv")} == {"smoothed"}
 
 
+@pytest.mark.parametrize("sure", [0, 1, 9])
+def test_a_sequence_without_a_motion_is_smoothed_to_itself(
+    moving: tuple[Path, Sequence], tmp_path: Path, sure: int
+) -> None:
+    header, *rows = moving[0].read_text().splitlines()
+    kept = [row if int(row.split(",")[0]) < sure else ",".join([*row.split(",")[:4], *4 * [""]]) for row in rows]
+    spots = tmp_path / "spots.csv"
+    spots.write_text("\n".join([header, *dict.fromkeys(kept)]) + "\n")
+    a, b = tmp_path / "a.csv", tmp_path / "b.csv"
+    ctreg("track", str(spots), "-m", CUBE, "-o", str(a), "--smooth", str(b), "-q", code=0 if sure else 1)
+    columns = ["slice", "status", "reason", "tx_mm", "qw", "sd_tx_mm"]
+    assert [[r[c] for c in columns] for r in table(b)] == [[r[c] for c in columns] for r in table(a)]
+    assert sum(r["status"] == "ok" for r in table(b)) == sure
+
+
 def test_smoothed_motion_never_replaces_another_output(moving: tuple[Path, Sequence], tmp_path: Path) -> None:
     spots, _ = moving
     same = str(tmp_path / "same.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ctreg_cli import pipeline
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.motion import StillAxes
-from ctreg_cli.tracking.smoother import TimedPose, smooth
+from ctreg_cli.tracking.smoother import LEAST_SLICES, TimedPose, smooth
 from tests.tracking.sequences import Sequence, error_of, sequence
 
 CUBE = load_rod_model("rod-cube-30x30x40")
@@ -112,17 +113,24 @@ def test_one_pose_comes_back_as_it_is() -> None:
 
 @pytest.mark.parametrize("shift_mm", [0.0, 150.0])
 def test_in_the_pipeline_whatever_the_model_origin(shift_mm: float) -> None:
-    """Jumps part the motion; slices that are not ok stay so; the rows are those of the track."""
+    """Jumps part the motion; slices that are not ok stay so, and so do short motions; the rows are the track's."""
     rods = tuple(replace(rod, start=rod.start + shift_mm, end=rod.end + shift_mm) for rod in CUBE.rods)
     model = RodModel(name="shifted", rods=rods)
-    made = sequence(8, n=24, **{**BREATHING, "model": model, "kind": "mixed", "sd_px": 0.1})  # type: ignore[arg-type]
+    made = sequence(8, n=48, **{**BREATHING, "model": model, "kind": "mixed", "sd_px": 0.1})  # type: ignore[arg-type]
     made.slices[10] = replace(made.slices[10], spots=made.slices[10].spots.take(np.arange(2)))
     tracked = list(pipeline.track(made.slices, model))
     after = pipeline.smoothed(tracked, model)
     assert [r.status for r in after] == [r.status for r in tracked]
     assert after[10].status == "no_pose"
     assert after[10].best is None
-    assert {r.method for r in after if r.status == "ok"} == {"smoothed"}
+    starts = [i for i, r in enumerate(tracked) if r.status == "ok" and (r.begins or not i)]
+    for first, end in pairwise([*starts, len(tracked)]):
+        motion = [i for i in range(first, end) if tracked[i].status == "ok"]
+        if len(motion) < LEAST_SLICES:
+            assert all(after[i] is tracked[i] for i in motion)
+        else:
+            assert {after[i].method for i in motion} == {"smoothed"}
+    assert {r.method for r in after} > {"smoothed", ""}
     nees = []
     for result, true in zip(after, made.truth, strict=True):
         if result.status == "ok":
