@@ -46,7 +46,7 @@ _GATE2 = 20.0
 #: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
 _WIDEST_GATE = 0.2
 #: and no noise carries a spot farther beyond the end of its rod than this share of the rod's length
-_MOST_BEYOND_END = 0.5
+MOST_BEYOND_END = 0.5
 #: matches up to which nothing checks the fit but the odds
 LEAST_CHECKED = 4
 #: how many triples of any five rods or more are tried
@@ -549,7 +549,7 @@ def visibility(
     noise = _noise_mm(model, scene)
     with np.errstate(invalid="ignore"):
         per_mm = np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of rod per mm of slab
-        near_end = np.minimum(scene.half_slab_mm * per_mm + 4 * noise * per_mm, _MOST_BEYOND_END * model.lengths)
+        near_end = np.minimum(scene.half_slab_mm * per_mm + 4 * noise * per_mm, MOST_BEYOND_END * model.lengths)
         slack = near_end + 0.01 * model.size_mm
         may = (lambda_mm >= -slack) & (lambda_mm <= model.lengths + slack)
         inner = slack + sd_mm

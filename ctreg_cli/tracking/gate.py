@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.registration.matching import Scene, nearest_assignment
+from ctreg_cli.registration.matching import MOST_BEYOND_END, Scene, nearest_assignment
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import Crossing, cross, greatest_tolerance_mm, model_lines
 
@@ -51,8 +51,9 @@ class Outlook:
         #: (n,) along each rod from the crossing to the nearer end; negative beyond it
         self._to_end_mm = np.minimum(along, model.lengths - along)
         #: (n,) along each rod
-        self._slack_mm = self.crossing.mm_per_height * (scene.half_slab_mm + _END_SD * self.noise_mm)
-        self._slack_mm += _END_SIZES * model.size_mm
+        slack_mm = self.crossing.mm_per_height * (scene.half_slab_mm + _END_SD * self.noise_mm)
+        # as in the matching: a rod that lies nearly in the slice is not seen wherever noise would carry its crossing
+        self._slack_mm = np.minimum(slack_mm, MOST_BEYOND_END * model.lengths) + _END_SIZES * model.size_mm
         self._in_field = self._inside_image()
 
     def _inside_image(self) -> BoolArray | None:
