@@ -95,10 +95,10 @@ def _read(path: Path, source: str, head: bytes) -> list[ImageRecord] | NotAnImag
     size = path.stat().st_size
     if size == 0:
         raise HeaderProblem("the file is empty")
-    header = plain_header(head, size)
+    header = plain_header(head, size) if head else None
     if header is None:
         with open_binary(path) as file:
-            header = read_header(file, size)
+            header = read_header(file, size, tried_plain=bool(head))
     if _is_not_an_image(header):
         return NotAnImage()
     series = _series_key(path, header.elements)
