@@ -35,6 +35,7 @@ from ctreg_cli.imaging.profile import (
 from ctreg_cli.imaging.uncertainty import (
     KEPT,
     centre_covariance,
+    even_variance,
     noise_field,
     odd_variance,
     responses,
@@ -369,6 +370,8 @@ class Law:
     #: (k,) sd of the noise as a smooth field, and of what differs from pixel to pixel
     smooth: FloatArray
     rough: FloatArray
+    #: (k,) variance of what else the background holds evenly, as tissue does
+    texture: FloatArray
     #: (k,) factor for faint spots
     faint: FloatArray
     #: (k, 2, 2) covariance that a perfect fit has as well, px²
@@ -380,6 +383,7 @@ class Law:
         ``factor`` (k,) is by how much worse, in variance, the centres are known now than where the law was measured.
         """
         scale = self.faint if factor is None else self.faint * factor
+        structure = np.maximum(structure, self.texture)
         covariance = centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
         covariance *= scale[:, None, None]
         covariance += self.least
@@ -391,6 +395,7 @@ class Law:
             response=self.response[:, which],
             smooth=self.smooth[which],
             rough=self.rough[which],
+            texture=self.texture[which],
             faint=self.faint[which],
             least=self.least[which],
         )
@@ -401,6 +406,7 @@ class Law:
             response=np.concatenate([self.response, other.response], axis=1),
             smooth=np.concatenate([self.smooth, other.smooth]),
             rough=np.concatenate([self.rough, other.rough]),
+            texture=np.concatenate([self.texture, other.texture]),
             faint=np.concatenate([self.faint, other.faint]),
             least=np.concatenate([self.least, other.least]),
         )
@@ -434,10 +440,14 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
         least[cut] += (MISFIT_SHARE * misfit * rough[cut] ** 2)[:, None, None] * response[1, cut]
     if len(long):
         least[long.index] += long.pair_covariance(fitted.parameters, by_spot, fitted.normal)
+    # what metal strong enough to be cut off does to its surroundings is no texture: it is looked at next to the spot
+    texture = even_variance(fitted.residuals, fitted.quiet, smooth=smooth, rough=rough)
+    texture[cut] = 0.0
     return Law(
         response=response,
         smooth=smooth,
         rough=rough,
+        texture=texture,
         faint=1.0 + (FAINT_SD * rough / fitted.height) ** 3,
         least=least,
     )

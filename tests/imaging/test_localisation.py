@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from ctreg_cli.imaging.segmentation import find_spots
+from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
 from ctreg_cli.imaging.spots import Spots
 from tests.imaging.rendering import as_slice, attainable, cramer_rao, render_grid, render_rod
 
@@ -230,3 +230,17 @@ def test_a_smooth_kernel_s_noise_is_not_taken_for_white(blur_px: float) -> None:
         error, covariance = errors(spots, uv)
         squared.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2)
     assert 0.75 < np.concatenate(squared).mean() < 1.25
+
+
+@pytest.mark.parametrize("length_px", [2.0, 3.0])
+def test_tissue_s_texture_about_a_dark_spot_is_owned_up_to(length_px: float) -> None:
+    """White noise hides from the Laplacian that the background is uneven over a few pixels."""
+    image, uv = render_grid(np.random.default_rng(13), 5, 40, contrast=800.0, diameter_mm=2.0, blur_mm=0.4)
+    rng, own = np.random.default_rng(14), []
+    for _ in range(6):
+        texture = gaussian_filter(rng.normal(0.0, 1.0, image.shape), length_px, mode="wrap")
+        noisy = 1200.0 - image + rng.normal(0.0, 20.0, image.shape) + 60.0 * texture / texture.std()
+        spots = find_spots(as_slice(noisy), SegmentationOptions(polarity="dark"))
+        error, covariance = errors(spots, uv)
+        own.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2)
+    assert 0.6 < np.concatenate(own).mean() < 1.5
