@@ -198,8 +198,9 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
         part = values[few], clipped_few, root_weights[few]
         first = np.where(long.mask, _start(blobs, n_clipped, brightest, LongSpots.none(k)), parameters)
         of_few = _fit_sharp(blobs.take(few), u, v, *part, n_clipped[few], brightest[:, few], first[:, few])
-        # of what is cut off, and neither way explains (a sharp kernel's undershoot), the common fit is the steadier one
-        least = np.where(n_clipped[few] > 0, CLEARLY_BETTER, np.inf) * _misfit(rows.by_spot[few])
+        # of what is cut off (one pixel of every image is the brightest), and neither way explains (a sharp kernel's
+        # undershoot), the common fit is the steadier one
+        least = np.where(n_clipped[few] > 1, CLEARLY_BETTER, np.inf) * _misfit(rows.by_spot[few])
         better = _misfit(of_few[2]) < least
         few = few[better]
         parameters[:, few], normal[few], rows.by_spot[few] = of_few[0][:, better], of_few[1][better], of_few[2][better]
