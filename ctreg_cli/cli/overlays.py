@@ -54,7 +54,10 @@ class OverlayWriter:
 
         numbers = {spot: str(spot) for spot in range(len(spot_slice.spots))}
         title = f"slice {index}  {slice_.info.source}  {len(spot_slice.spots)} spots"
-        self._save(draw_overlay(slice_, spot_slice.spots, labels=numbers, title=title, show_rejected=True), index)
+        picture = draw_overlay(
+            slice_, spot_slice.spots, labels=numbers, title=title, show_rejected=True, label_word="spots"
+        )
+        self._save(picture, index)
 
     def draw_result(self, slice_: Slice, result: FrameResult) -> None:
         """The matched spots with their rods' names, and where missing rods should be."""

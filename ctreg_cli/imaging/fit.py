@@ -10,12 +10,16 @@ from ctreg_cli.imaging.profile import CENTRE, FLATNESS, GRADIENT, LOG_HEIGHT, N_
 #: steps at most, and so many of them for all spots together. A spot is done when its centre moves by less than this
 #: (px), or the step by less than this (sd²): the next would be several times smaller
 MAX_STEPS, STEPS_TOGETHER, DONE_PX, DONE_SD2 = 10, 3, 4e-3, 1e-3
+#: of sharp spots at most so many: few pixels tell height, size and flatness apart
+MAX_SHARP_STEPS = 20
+#: and they are done only when the step is less than this as well, sd²
+DONE_SHARP_SD2 = 0.1
 #: what is left of a spot that is cut off goes to its minimum by smaller steps, px; more so if it is thick
 DONE_CUT_PX = 5e-4
 #: of a long spot, how flat it is tells one rod from two: its ln γ moves by less than this in the last step
 DONE_FLATNESS = 0.05
 #: range of ln β and ln γ: from tails heavier than a Gaussian's to nearly a box
-FLATNESS_RANGE = (-0.5, 1.5)
+FLATNESS_RANGE = (-0.5, 2.5)
 #: Levenberg–Marquardt damping; a step that is small only because of much damping does not end the fit
 FIRST_DAMPING, DAMPING_FACTOR, DONE_DAMPING = 1e-3, 10.0, 1e-2
 
@@ -33,6 +37,8 @@ def _per_parameter(*, centre: float, log_height: float, background: float, shape
 PRIOR = _per_parameter(centre=1e-9, log_height=0.7**-2, background=1e-9, shape=0.7**-2, flatness=0.1**-2)
 #: the plateau of a long spot is as long as its rod's tilt and the slab make it
 LONG_FLATNESS_PRIOR = 0.7**-2
+#: a sharp spot is anything from a Gaussian to nearly a box
+SHARP_FLATNESS_PRIOR = 0.7**-2
 _UNIT_MATRIX = np.eye(N_PARAMETERS)
 #: farthest from the start (10, 1): px for the centre, a factor of eight for height and shape
 MAX_CHANGE = _per_parameter(centre=2.0, log_height=2.0, background=np.inf, shape=2.0, flatness=np.inf)
@@ -48,7 +54,8 @@ def fit(rows: Rows, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     if not done.all():
         few = np.flatnonzero(~done)
         slow = rows.take(few)
-        parameters[:, few], normal[few], _ = _steps(slow, start[:, few], parameters[:, few], MAX_STEPS - STEPS_TOGETHER)
+        most = (MAX_SHARP_STEPS if rows.unusual else MAX_STEPS) - STEPS_TOGETHER
+        parameters[:, few], normal[few], _ = _steps(slow, start[:, few], parameters[:, few], most)
         rows.by_spot[few] = slow.by_spot
     return parameters, normal
 
@@ -64,6 +71,9 @@ def _steps(
     unit[7] = np.exp(-start[6])  # a step in l1 is measured in the spot's own coordinates, as all others are
     done_px = np.where(rows.cut_off, DONE_CUT_PX, DONE_PX)
     prior = np.broadcast_to(PRIOR, start.shape)
+    if rows.unusual:
+        prior = prior.copy()
+        prior[FLATNESS] = SHARP_FLATNESS_PRIOR
     if rows.long is not None:
         prior = prior.copy()
         prior[FLATNESS, rows.long] = LONG_FLATNESS_PRIOR
@@ -89,7 +99,10 @@ def _steps(
         small = np.maximum(np.abs(change[0]), np.abs(change[1])) < done_px
         if rows.long is not None:
             small &= ~rows.long | (np.abs(trial[FLATNESS] - parameters[FLATNESS]) < DONE_FLATNESS)
-        small |= np.einsum("ki,ik->k", gradient, step) < DONE_SD2
+        gain = np.einsum("ki,ik->k", gradient, step)
+        if rows.unusual:
+            small &= gain < DONE_SHARP_SD2
+        small |= gain < DONE_SD2
         small &= damping <= DONE_DAMPING
         if not stale and small.all():
             parameters, done = trial, small

@@ -157,11 +157,16 @@ class Follower:
             image = UprightImage.of(slice_, bright=self.options.polarity == "bright")
             middles = np.rint(spots.uv_px[distance[due].argmin(axis=1)]).astype(np.intp)
             blobs, lone = measure_lone_blobs(image, middles, RADIUS_PX)
-            learned = rods[due][lone]
-            self._waits |= dict.fromkeys(learned.tolist(), (0, 0))
+            blobs, learned = blobs.take(lone), rods[due][lone]
             if len(learned):
-                blobs = blobs.take(lone)
-                known = _Known.of(learned, blobs, fit_profiles(blobs, image.ceiling))
+                fitted = fit_profiles(blobs, image.ceiling)
+                smooth = ~(fitted.sharp | fitted.flat)  # of the others a step is not worth more than a fit
+                if not smooth.all():
+                    blobs, learned = blobs.take(smooth), learned[smooth]
+                    fitted = fit_profiles(blobs, image.ceiling)
+            if len(learned):
+                self._waits |= dict.fromkeys(learned.tolist(), (0, 0))
+                known = _Known.of(learned, blobs, fitted)
                 self._known = known if self._known is None else self._known.joined(known)
         return spots
 
@@ -494,6 +499,8 @@ def _stepped(
         quiet=distance > NOISE_BEYOND_PX,
         height=np.minimum(np.exp(parameters[LOG_HEIGHT]), np.maximum(ceiling - parameters[BACKGROUND], 1.0)),
         n_clipped=n_clipped,
+        sharp=np.zeros(len(n_clipped), dtype=bool),
+        flat=np.zeros(len(n_clipped), dtype=bool),
         ceiling=ceiling,
     )
     return fitted, shift, np.asarray(small)

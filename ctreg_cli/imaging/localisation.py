@@ -3,7 +3,8 @@
 The profile of :mod:`.profile` is fitted to all windows at once (:mod:`.fit`). Pixels are weighted by what can be wrong
 with them: noise everywhere, and structure of the background (streaks, plate edges) that grows with the distance from
 the blob. The covariance has the same two parts (:mod:`.uncertainty`), both measured in the window; added to these is
-what a steep edge seen in few pixels costs, and of a long spot the chance that it is two rods (:mod:`.plateau`).
+what a steep edge seen in few pixels costs, and of a long spot the chance that it is two rods (:mod:`.plateau`). Spots
+that come out sharp or flat are fitted again with the profile that is made for them.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.imaging.blob import Blobs, inverse_elements
+from ctreg_cli.imaging.blob import Blobs, axes_of, inverse_elements
 from ctreg_cli.imaging.fit import fit
 from ctreg_cli.imaging.plateau import LongSpots, rod_flatness
 from ctreg_cli.imaging.profile import (
@@ -26,12 +27,15 @@ from ctreg_cli.imaging.profile import (
     LONG_BETA,
     N_PARAMETERS,
     SHAPE,
+    Areas,
     Rows,
     in_pixels,
+    moments_of_shape,
 )
 from ctreg_cli.imaging.uncertainty import (
     KEPT,
     centre_covariance,
+    even_variance,
     noise_field,
     odd_variance,
     responses,
@@ -50,12 +54,30 @@ LEFT_OUT = 1e-12
 #: what pixels cost a perfect fit: an edge that falls by so much of the height in a pixel shifts the profile by this sd,
 #: px, a gentler one by this power of its slope less (measured without noise)
 STEEP, STEEP_SD_PX, STEEP_POWER = 0.8, 0.002, 5.5
+#: where an edge falls by more of the height in a pixel, or one that is cut off by more of the ceiling, pixels are means
+#: over their areas; as far as this beyond half height, px
+SHARP, SHARP_CUT, SHARP_REACH_PX = 0.7, 2.2, 2.0
+#: a top flatter than this (ln β) is not one that the common fit foresees
+FLAT, FLAT_CUT = 0.6, 0.2
+#: one that is cut off may be an edge as well where its mean weighted square of residuals is more than this
+POOR = 3.0
+#: by what share of the height its edge falls in a pixel, to start from
+FLAT_EDGE = 0.4
+#: fewer pixels above half height do not tell whether a spot is long; if it is taken for a long one, is nearly as steep,
+#: and its mean weighted square of residuals is more than noise would make it, it is fitted in that way too
+COARSE_PX2, SHARP_COARSE, COARSE_MISFIT = 10.0, 0.6, 1.15
+#: what is cut off is seen so only if that lowers its mean weighted square of residuals to this share
+CLEARLY_BETTER = 0.95
+#: what that leaves, px (measured without noise)
+SHARP_SD_PX = 0.0005
 #: the same of a spot that is cut off, where its edge falls by so much of the ceiling in a pixel: of such a
 #: spot only the sides are seen
 CUT, CUT_SD_PX, CUT_POWER = 1.5, 0.0042, 1.2
+#: that holds up to this half width, px; beyond it an edge about a flat top fits well
+RIM_PX = 2.5
 #: of a spot that is cut off, and that the profile does not fit (a sharp kernel's undershoot), the variance that noise
 #: makes grows by this share of what the mean weighted square of its residuals exceeds 1 by
-MISFIT_SHARE = 0.6
+MISFIT_SHARE = 1.2
 #: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
 #: variance is twice that of the linear law where it stands out by so many sd of the noise
 FAINT_SD = 5.0
@@ -66,6 +88,8 @@ SMOOTH_NOISE_SHARE = 0.7
 START_BLUR_PX2 = 0.1
 #: start of ln β, between a Gaussian and a flat top
 START_LOG_BETA = 0.15
+#: of sharp spots
+SHARP_START_LOG_BETA = 0.3
 #: height over which a centre to start from is taken, in spot heights: background and its gradient do not reach there
 START_LEVEL = 0.3
 #: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
@@ -107,6 +131,10 @@ class Profiles(NamedTuple):
     #: (k,) height of the blobs, as far as it is not cut off, and how many of their pixels are
     height: FloatArray
     n_clipped: IntArray
+    #: (k,) of which profiles pixels were taken as means over their areas
+    sharp: BoolArray
+    #: (k,) which profiles are edges about flat tops
+    flat: BoolArray
     #: value at which the image is cut off
     ceiling: float
 
@@ -161,12 +189,38 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
 
     brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
     long = LongSpots.of(blobs)
-    if len(long):
-        along, across = long.coordinates(u, v)
-        rows = Rows(along, across, values, clipped, root_weights, long.mask)
-    else:
-        rows = Rows(u, v, values, clipped, root_weights)
+    rows = _rows(u, v, values, clipped, root_weights, long)
     parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
+    sharp = _is_sharp(blobs, parameters, rows, long, n_clipped > 0, ceiling)
+    few = np.flatnonzero(sharp)
+    if len(few):
+        clipped_few = None if clipped is None else clipped[few]
+        part = values[few], clipped_few, root_weights[few]
+        first = np.where(long.mask, _start(blobs, n_clipped, brightest, LongSpots.none(k)), parameters)
+        of_few = _fit_sharp(blobs.take(few), u, v, *part, n_clipped[few], brightest[:, few], first[:, few])
+        # of what is cut off (one pixel of every image is the brightest), and neither way explains (a sharp kernel's
+        # undershoot), the common fit is the steadier one
+        least = np.where(n_clipped[few] > 1, CLEARLY_BETTER, np.inf) * _misfit(rows.by_spot[few])
+        better = _misfit(of_few[2]) < least
+        few = few[better]
+        parameters[:, few], normal[few], rows.by_spot[few] = of_few[0][:, better], of_few[1][better], of_few[2][better]
+        long = long.replaced(few, of_few[3].take(better))
+        sharp[:] = False
+        sharp[few] = True
+    flat = np.zeros(k, dtype=bool)
+    is_poor = _misfit(rows.by_spot) > POOR
+    may_be_flat = (n_clipped > 0) & ((parameters[FLATNESS] > FLAT_CUT) | is_poor)
+    may_be_flat |= parameters[FLATNESS] > FLAT
+    few = np.flatnonzero(may_be_flat & ~long.mask & (blobs.area > np.pi * RIM_PX**2))
+    if len(few):
+        clipped_few = None if clipped is None else clipped[few]
+        part = values[few], clipped_few, root_weights[few]
+        first = _flat_start(parameters[:, few], blobs.take(few), n_clipped[few] > 0)
+        edges, edges_normal, by_spot = _fit_flat(u, v, *part, first, blobs.radius)
+        better = _misfit(by_spot) < _misfit(rows.by_spot[few])
+        few = few[better]
+        parameters[:, few], normal[few], rows.by_spot[few] = edges[:, better], edges_normal[better], by_spot[better]
+        flat[few] = True
     return Profiles(
         parameters=parameters,
         long=long,
@@ -180,8 +234,132 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
         quiet=usable & (distance > NOISE_BEYOND_PX),
         height=blobs.height,
         n_clipped=n_clipped,
+        sharp=sharp,
+        flat=flat,
         ceiling=ceiling,
     )
+
+
+def _rows(
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    long: LongSpots,
+    areas: Areas | None = None,
+) -> Rows:
+    """:class:`.profile.Rows` of windows of which some show ``long`` spots, seen along their own axes."""
+    if not len(long):
+        return Rows(u, v, values, clipped, root_weights, areas=areas)
+    along, across = long.coordinates(u, v)
+    return Rows(along, across, values, clipped, root_weights, long.mask, areas)
+
+
+def _misfit(by_spot: FloatArray) -> FloatArray:
+    """Mean weighted squares (k,) of residuals, the last of the rows (k, 11, p)."""
+    return np.asarray((by_spot[:, -1] ** 2).mean(axis=1))
+
+
+def _is_sharp(
+    blobs: Blobs, parameters: FloatArray, rows: Rows, long: LongSpots, clipped: BoolArray, ceiling: float
+) -> BoolArray:
+    """Whether (k,) pixels are too wide to be seen as points of a fitted profile.
+
+    Or whether a spot of few pixels was taken for a long one, and does not look like that.
+    """
+    at_edge, at_ceiling = _steepness(parameters, long.mask, ceiling)
+    sharp = (at_edge > SHARP) | (clipped & (at_ceiling > SHARP_CUT))
+    coarse = long.index[blobs.area[long.index] < COARSE_PX2]
+    sharp[coarse] |= (at_edge[coarse] > SHARP_COARSE) & (_misfit(rows.by_spot[coarse]) > COARSE_MISFIT)
+    return np.asarray(sharp)
+
+
+def _reach(parameters: FloatArray, radius: int) -> float:
+    """How far from the middles of windows of this radius profiles are so steep that pixels are no points, px."""
+    half_axes = 0.5 * axes_of(moments_of_shape(parameters))[0]
+    return SHARP_REACH_PX + float(np.minimum(half_axes, radius).max())
+
+
+def _flat_start(parameters: FloatArray, blobs: Blobs, clipped: BoolArray) -> FloatArray:
+    """Parameters (10, k) to start from: those of another profile, or of what is cut off, a rod half of which is seen.
+
+    Of a thick rod the rim alone is seen there, which lies near the half-height contour whatever the height.
+    """
+    uu, uv, vv = inverse_elements(4.0 * blobs.moments)
+    start, l_vv = parameters.copy(), np.sqrt(vv)
+    shape = np.stack([0.5 * np.log(uu - uv * uv / vv), uv / l_vv, np.log(l_vv)])
+    start[SHAPE] = np.where(clipped, shape, parameters[SHAPE])
+    start[LOG_HEIGHT] = np.where(clipped, np.log(2.0 * blobs.height), parameters[LOG_HEIGHT])
+    steep = -np.log(np.log(2.0)) - 0.5 * (shape[0] + shape[2]) + np.log(FLAT_EDGE)
+    start[FLATNESS] = np.where(clipped, np.maximum(steep, FLAT), parameters[FLATNESS])
+    return start
+
+
+def _fit_flat(
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    first: FloatArray,
+    radius: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit edges about flat tops, from the ``first`` parameters (10, k); else as :func:`_fit_sharp`."""
+    rows = Rows(u, v, values, clipped, root_weights, flat=True)
+    steep = np.log(2.0) * np.exp(first[FLATNESS] + np.maximum(first[SHAPE][0], first[SHAPE][2])) > SHARP
+    if clipped is not None or steep.any():
+        areas, points_u, points_v = Areas.within(u, v, _reach(first, radius))
+        rows = Rows(points_u, points_v, values, clipped, root_weights, areas=areas, flat=True)
+    parameters, normal = fit(rows, first)
+    return parameters, normal, rows.by_spot
+
+
+def _fit_sharp(
+    blobs: Blobs,
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    n_clipped: IntArray,
+    brightest: FloatArray,
+    first: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, LongSpots]:
+    """Fit profiles to pixels that are means over their areas.
+
+    Which spots are long tells their fitted shape: few pixels above half height do not.
+
+    Args:
+        blobs: the windows.
+        u: (p,) coordinates of their pixels.
+        v: likewise.
+        values: (k, p).
+        clipped: (k, p) which of these are cut off, if any is.
+        root_weights: (k, p).
+        n_clipped: (k,) how many of the blobs' own are cut off.
+        brightest: (2, k) centres to start from.
+        first: (10, k) parameters of spots that are not long, to start from.
+
+    Returns:
+        Parameters (10, k), normal matrices (k, 10, 10), derivatives and residuals (k, 11, p), and what is long.
+    """
+    areas, points_u, points_v = Areas.within(u, v, _reach(first, blobs.radius))
+    long = LongSpots.none(len(blobs))
+    rows = _rows(points_u, points_v, values, clipped, root_weights, long, areas)
+    start = first.copy()
+    start[FLATNESS] = SHARP_START_LOG_BETA
+    parameters, normal = fit(rows, start)
+    shown = LongSpots.of_moments(moments_of_shape(parameters))
+    if len(shown):
+        few = shown.index
+        long = shown.take(few)
+        clipped = None if clipped is None else clipped[few]
+        again = _rows(points_u, points_v, values[few], clipped, root_weights[few], long, areas)
+        start = _start(blobs.take(few), n_clipped[few], brightest[:, few], long)
+        parameters[:, few], normal[few] = fit(again, start)
+        rows.by_spot[few] = again.by_spot
+    return parameters, normal, rows.by_spot, shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -193,6 +371,8 @@ class Law:
     #: (k,) sd of the noise as a smooth field, and of what differs from pixel to pixel
     smooth: FloatArray
     rough: FloatArray
+    #: (k,) variance of what else the background holds evenly, as tissue does
+    texture: FloatArray
     #: (k,) factor for faint spots
     faint: FloatArray
     #: (k, 2, 2) covariance that a perfect fit has as well, px²
@@ -204,6 +384,7 @@ class Law:
 
     def made_by(self, structure: FloatArray) -> FloatArray:
         """(k, 2, 2) px²: what noise, and structure of these variances (k,), make of centres in sure windows."""
+        structure = np.maximum(structure, self.texture)
         return centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
 
     def scaled(self, covariance: FloatArray, factor: FloatArray | float) -> FloatArray:
@@ -221,6 +402,7 @@ class Law:
             response=self.response[:, which],
             smooth=self.smooth[which],
             rough=self.rough[which],
+            texture=self.texture[which],
             faint=self.faint[which],
             least=self.least[which],
         )
@@ -231,6 +413,7 @@ class Law:
             response=np.concatenate([self.response, other.response], axis=1),
             smooth=np.concatenate([self.smooth, other.smooth]),
             rough=np.concatenate([self.rough, other.rough]),
+            texture=np.concatenate([self.texture, other.texture]),
             faint=np.concatenate([self.faint, other.faint]),
             least=np.concatenate([self.least, other.least]),
         )
@@ -257,17 +440,21 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
         influence = long.turned_back(influence)
     rough, smooth, length = noise_field(fitted.residuals, fitted.quiet, radius)
     response = responses(influence, radius, length)
-    least = _of_pixels(fitted.parameters, long.mask, fitted.n_clipped > 0, fitted.ceiling)[:, None, None] * np.eye(2)
+    least = _of_pixels(fitted)[:, None, None] * np.eye(2)
     cut = np.flatnonzero(fitted.n_clipped)
     if len(cut):
-        misfit = np.maximum((by_spot[cut, -1] ** 2).mean(axis=1) - 1.0, 0.0)
+        misfit = np.maximum(_misfit(by_spot[cut]) - 1.0, 0.0)
         least[cut] += (MISFIT_SHARE * misfit * rough[cut] ** 2)[:, None, None] * response[1, cut]
     if len(long):
         least[long.index] += long.pair_covariance(fitted.parameters, by_spot, fitted.normal)
+    # what metal strong enough to be cut off does to its surroundings is no texture: it is looked at next to the spot
+    texture = even_variance(fitted.residuals, fitted.quiet, smooth=smooth, rough=rough)
+    texture[cut] = 0.0
     return Law(
         response=response,
         smooth=smooth,
         rough=rough,
+        texture=texture,
         faint=1.0 + (FAINT_SD * rough / fitted.height) ** 3,
         least=least,
     )
@@ -285,17 +472,29 @@ def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolAr
     return (clipped if n_clipped.any() else None), n_clipped
 
 
-def _of_pixels(parameters: FloatArray, long: BoolArray, clipped: BoolArray, ceiling: float) -> FloatArray:
+def _of_pixels(fitted: Profiles) -> FloatArray:
     """Variance (k,) of the centre, px², because a steep edge is seen in few pixels, over which it is not averaged."""
+    shape = fitted.parameters[SHAPE]
+    at_edge, at_ceiling = _steepness(fitted.parameters, fitted.long.mask, fitted.ceiling)
+    width = np.exp(-np.maximum(shape[0], shape[2]))
+    sd = STEEP_SD_PX * np.minimum(at_edge / STEEP, 1.5) ** STEEP_POWER / np.sqrt(width)
+    cut_sd = CUT_SD_PX * np.minimum(at_ceiling / CUT, 2.0) ** CUT_POWER
+    sd = np.where(fitted.sharp, SHARP_SD_PX, sd)
+    sd = np.where(fitted.flat, SHARP_SD_PX, sd)
+    cut_sd *= np.where(
+        fitted.flat, np.minimum(RIM_PX / width, 1.0) ** 2, 1.0
+    )  # of an edge, the longer the rim the less
+    return np.asarray(np.where(fitted.n_clipped > 0, np.maximum(sd, cut_sd), sd) ** 2)
+
+
+def _steepness(parameters: FloatArray, long: BoolArray, ceiling: float) -> tuple[FloatArray, FloatArray]:
+    """By what share (k,) of the height profiles fall in a pixel at half height; of the ceiling, where they reach it."""
     width = np.exp(-np.maximum(parameters[SHAPE][0], parameters[SHAPE][2]))
     beta = np.where(long, LONG_BETA, np.exp(parameters[FLATNESS]))
-    steepness = np.log(2.0) * beta / width
-    sd = STEEP_SD_PX * np.minimum(steepness / STEEP, 1.5) ** STEEP_POWER / np.sqrt(width)
+    at_edge = np.log(2.0) * beta / width
     # 2^(−q^β) is the ceiling over the height where q^β is this
     at_ceiling = (parameters[LOG_HEIGHT] - np.log(np.maximum(ceiling - parameters[BACKGROUND], 1e-9))) / np.log(2.0)
-    steepness *= 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
-    cut_sd = CUT_SD_PX * np.minimum(steepness / CUT, 2.0) ** CUT_POWER
-    return np.asarray(np.where(clipped, np.maximum(sd, cut_sd), sd) ** 2)
+    return at_edge, at_edge * 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
 
 
 def distance_beyond_edge(moments: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
-from ctreg_cli.imaging.blob import Blobs
+from ctreg_cli.imaging.blob import Blobs, axes_of
 from ctreg_cli.imaging.profile import FLATNESS, N_PARAMETERS, SHAPE
 
 #: a spot of this ratio of axes is long
@@ -47,7 +47,17 @@ class LongSpots:
     @classmethod
     def of(cls, blobs: Blobs) -> LongSpots:
         """By the moments of the half-height regions."""
-        major, minor, angle = blobs.axes
+        return cls.of_moments(blobs.moments)
+
+    @classmethod
+    def none(cls, k: int) -> LongSpots:
+        """None of ``k`` is long."""
+        return cls.of_moments(np.broadcast_to(np.eye(2), (k, 2, 2)))
+
+    @classmethod
+    def of_moments(cls, moments: FloatArray) -> LongSpots:
+        """By second moments (k, 2, 2)."""
+        major, minor, angle = axes_of(moments)
         mask = major > LONG_RATIO * minor
         angle = np.where(mask, angle, 0.0)
         cos, sin = np.cos(angle), np.sin(angle)
@@ -62,6 +72,12 @@ class LongSpots:
         """Of some of the spots."""
         mask = self.mask[which]
         return LongSpots(mask=mask, index=np.flatnonzero(mask), rotation=self.rotation[which])
+
+    def replaced(self, at: IntArray, by: LongSpots) -> LongSpots:
+        """The same but for the spots at the indices ``at``."""
+        mask, rotation = self.mask.copy(), self.rotation.copy()
+        mask[at], rotation[at] = by.mask, by.rotation
+        return LongSpots(mask=mask, index=np.flatnonzero(mask), rotation=rotation)
 
     def joined(self, other: LongSpots) -> LongSpots:
         """Of these spots and others."""

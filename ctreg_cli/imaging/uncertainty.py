@@ -23,6 +23,8 @@ KEPT = 0.65
 SURE_OF_STRUCTURE = 3.0
 #: sd of a normal distribution over its median absolute deviation
 MAD_TO_SD = 1.4826
+#: standard error of a ratio of two variances by medians, over that of one by the mean of squares
+MEDIAN_LOSS = 2.33
 #: a scanner stores whole numbers: noise is never less than rounding, in stored units
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
 #: what the ring holds counts as structure only beyond so many times the variance that its noise may seem to have
@@ -160,6 +162,19 @@ def odd_variance(
     excess = variance / noise**2 - 1.0
     chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
     return np.asarray(noise**2 * excess * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
+
+
+def even_variance(residuals: FloatArray, quiet: BoolArray, *, smooth: FloatArray, rough: FloatArray) -> FloatArray:
+    """Variance (k,) beyond ``rough`` noise of what lies evenly all over a window, where ``smooth`` noise is less.
+
+    By the median, which a streak through a part of the window does not move; chance as in :func:`odd_variance`.
+    """
+    squares = np.where(quiet, residuals * residuals, np.nan)
+    count = np.maximum(np.count_nonzero(quiet, axis=1), 1)
+    variance = MAD_TO_SD**2 * np.nan_to_num(nan_quantile(squares, 0.5))
+    excess = variance / smooth**2 - 1.0
+    chance = SURE_OF_STRUCTURE * MEDIAN_LOSS * np.sqrt(2.0 / count)
+    return np.asarray((variance - rough**2) * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
 
 
 @cache

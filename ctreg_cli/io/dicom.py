@@ -91,10 +91,10 @@ def read_dicom(path: Path, source: str, head: bytes = b"", size: int | None = No
 def _read(path: Path, source: str, head: bytes, size: int) -> list[ImageRecord] | NotAnImage:
     if size == 0:
         raise HeaderProblem("the file is empty")
-    header = plain_header(head, size)
+    header = plain_header(head, size) if head else None
     if header is None:
         with open_binary(path) as file:
-            header = read_header(file, size)
+            header = read_header(file, size, tried_plain=bool(head))
     if _is_not_an_image(header):
         return NotAnImage()
     series = _series_key(path, header.elements)

@@ -309,19 +309,21 @@ def _is_bare(head: bytes) -> bool:
     return head[4:6] in _KNOWN_VR or (head[0] != 0 and head[3] == 0 and length < len(head))
 
 
-def read_header(file: BinaryIO, size: int) -> Header:
+def read_header(file: BinaryIO, size: int, *, tried_plain: bool = False) -> Header:
     """Read the header of a file opened at its start, ``size`` bytes long.
+
+    Where :func:`plain_header` has been tried on its head already (``tried_plain``), that is not tried again.
 
     Raises:
         HeaderProblem: not a DICOM file, or one that cannot be walked through.
     """
     notes: list[str] = []
-    head = file.read(HEAD_BYTES)
-    plain = plain_header(head, size)
-    if plain is not None:
-        return plain
-    head = head[: PREAMBLE_BYTES + 4]
-    file.seek(len(head))
+    if not tried_plain:
+        plain = plain_header(file.read(HEAD_BYTES), size)
+        if plain is not None:
+            return plain
+        file.seek(0)
+    head = file.read(PREAMBLE_BYTES + 4)
     if head[PREAMBLE_BYTES:] != MAGIC:
         if not _is_bare(head):
             raise HeaderProblem("the file is not DICOM (no DICM mark at byte 128)")

@@ -50,6 +50,7 @@ def draw_overlay(
     predicted_names: Sequence[str] = (),
     title: str = "",
     show_rejected: bool = False,
+    label_word: str = "labelled",
 ) -> Image.Image:
     """Draw spots, their rods and the rods not seen over a slice.
 
@@ -61,6 +62,7 @@ def draw_overlay(
         predicted_names: their names, r of them, or none.
         title: one line above the picture.
         show_rejected: also mark rejected candidates, with the reason.
+        label_word: what the legend calls spots that have a label.
 
     Returns:
         An RGB picture, about 720 or 1450 pixels wide.
@@ -88,7 +90,13 @@ def draw_overlay(
         canvas.paste(panel, (MARGIN + i * (PANEL + MARGIN), LINE + MARGIN))
     draw, font = ImageDraw.Draw(canvas), _font(FONT_SIZE)
     draw.text((MARGIN, MARGIN // 2 + 2), title, fill=TEXT, font=font)
-    _draw_legend(draw, font, spots, labels, len(predicted), show_rejected, PANEL + LINE + 2 * MARGIN)
+    counts = [
+        (len(labels), label_word, MATCHED),
+        (len(spots) - len(labels), "other spots" if labels else "spots", UNMATCHED),
+        (len(predicted), "missing", MISSING),
+        (sum(spots.n_rejected.values()) if show_rejected else 0, "rejected", REJECTED),
+    ]
+    _draw_legend(draw, font, counts, PANEL + LINE + 2 * MARGIN)
     return canvas
 
 
@@ -268,18 +276,9 @@ def _bounds(points: Sequence[tuple[float, float]]) -> Box:
 def _draw_legend(
     draw: ImageDraw.ImageDraw,
     font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
-    spots: Spots,
-    labels: Mapping[int, str],
-    n_missing: int,
-    show_rejected: bool,
+    counts: Sequence[tuple[int, str, Colour]],
     y: float,
 ) -> None:
-    counts = [
-        (len(labels), "labelled", MATCHED),
-        (len(spots) - len(labels), "other spots" if labels else "spots", UNMATCHED),
-        (n_missing, "missing", MISSING),
-        (sum(spots.n_rejected.values()) if show_rejected else 0, "rejected", REJECTED),
-    ]
     x = float(MARGIN)
     for count, word, colour in counts:
         if count:
