@@ -19,6 +19,7 @@ from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley, covariance_al
 from ctreg_cli.registration.matching import Matches, Scene, doubt, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.other_scale import LOOSE_SHARE, log_odds_of_other_scale, loose_matches
 from ctreg_cli.registration.refine import (
     Linearisation,
     Observations,
@@ -60,8 +61,8 @@ _WORTH_SAYING = 1e-3
 #: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
 #: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
-#: how far off a wrong frame or scale may put the spots, in frame sizes; and the ln odds that it is so
-_LOOSE_SHARE, _LOG_PRIOR_LOOSE = 0.02, math.log(0.1)
+#: ln odds that a frame is not its drawing, or the spots are worse than they say
+_LOG_PRIOR_LOOSE = math.log(0.1)
 #: two crossings nearer than this share of the frame's size may leave one spot, where nothing tells how large spots are
 _UNRESOLVED = 0.04
 #: matches below which nothing can be checked: three spots always fit
@@ -198,7 +199,7 @@ def _seen_or_nearly(model: RodModel, scene: Scene, scale: Scale, best: Candidate
     free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_index)
     for rod, place_mm in zip(best.missing_rods, best.missing_px * scale.mm_per_px, strict=True):
         gap = np.linalg.norm(scene.xy_mm[free] - place_mm, axis=1)
-        if len(free) and gap.min() < 2 * _LOOSE_SHARE * model.size_mm:
+        if len(free) and gap.min() < 2 * LOOSE_SHARE * model.size_mm:
             spot_of_rod[0, rod] = free[gap.argmin()]
             free = np.delete(free, gap.argmin())
     return observations(scene, spot_of_rod)
@@ -263,15 +264,10 @@ def decide(
         return refused("bad_fit")
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return refused("bad_fit")
-    if (
-        not frame_is_known
-        and len(best.missing_rods) >= 2
-        and len(spots) - len(best.rod_index) >= 2
-        and _fits_better_loosely(model, scene, best)
-    ):
-        return refused("bad_fit")
     if undetermined(model, best.covariance):
         return refused("singular_geometry")
+    if not frame_is_known and _fits_better_loosely(model, scene, best):
+        return refused("bad_fit")
     doubts, rivals = doubts_and_rivals(candidates, twins(model))
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
@@ -403,18 +399,23 @@ def near_misses_p(scene: Scene, scale: Scale, best: Candidate) -> float:
 
 
 def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool:
-    """Whether more spots become rods, at better odds, once the spots (or the frame) may be a few percent off.
+    """Whether more spots become rods once the spots (or the frame) may be a few percent off, or the scales.
 
     With a wrong scale or a frame that is not its drawing the true match does not fit, and a chance match of a few of
-    its spots is what remains; it must not pass for the pose.
+    its spots is what remains, or one that bends to fit most; it must not pass for the pose.
     """
-    slack = (_LOOSE_SHARE * model.size_mm) ** 2
-    loose = replace(scene, covariance_mm=scene.covariance_mm + slack * np.eye(2))
     n = len(best.rod_index)
-    matches = search(model, loose, least_matches=n + 1)
+    n_free, n_missing = len(scene.xy_mm) - n, len(model) - n
+    if min(n_free, n_missing) < 1:
+        return False
+    matches = loose_matches(model, scene, n + 1)
     if matches is None:
         return False
-    return float(matches.log_odds[0]) + _LOG_PRIOR_LOOSE > best.log_odds
+    many = min(n_free, len(best.missing_rods)) >= 2
+    if many and float(matches.log_odds[0]) + _LOG_PRIOR_LOOSE > best.log_odds:
+        return True
+    spot_of_rod = _spots_of_rods(model, best)[0]
+    return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, matches) > -RIVAL_LOG_ODDS
 
 
 def undetermined(model: RodModel, covariance: FloatArray) -> bool:
