@@ -289,7 +289,7 @@ def decide(
     covariance, suspicion = covariance_with_misfit(
         model, best.T_slice_model, best.covariance, _seen_or_nearly(model, scene, scale, best)
     )
-    if covariance is None:
+    if covariance is None or (suspicion and not frame_is_known and _fits_better_turned(model, scene, best)):
         return refused("bad_fit")
     if suspicion:
         best = replace(best, covariance=frozen(covariance, (6, 6)))
@@ -416,6 +416,18 @@ def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool
         return True
     spot_of_rod = _spots_of_rods(model, best)[0]
     return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, matches) > -RIVAL_LOG_ODDS
+
+
+def _fits_better_turned(model: RodModel, scene: Scene, best: Candidate) -> bool:
+    """Whether other matches of as many spots fit as well with other scales: what a misfit of these may come from.
+
+    A frame that is nearly its own image has such matches: with a wrong scale the wrong one can fit better.
+    """
+    spot_of_rod = _spots_of_rods(model, best)[0]
+    loose = loose_matches(model, scene, len(best.rod_index))
+    if loose is not None:
+        loose = loose.subset((loose.spot_of_rod != spot_of_rod).any(axis=1))
+    return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, loose) > -RIVAL_LOG_ODDS
 
 
 def undetermined(model: RodModel, covariance: FloatArray) -> bool:
