@@ -48,6 +48,7 @@ from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, 
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SMOOTHING_LOSS, SegmentationOptions, measure_spots
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.imaging.uncertainty import noise_field
 from ctreg_cli.imaging.window import UprightImage, disc, grid
 
 #: radius of the windows, px: the least of those that the search tries
@@ -65,9 +66,9 @@ SLICE_TO_SLICE_LN = 0.1
 AXES_MEMORY, MAX_CHANGE, LONG_DOUBT = 4.0, 1.5, 1.15
 #: mean squares of residuals beyond so many times what they were are something new in the window
 MAX_MISFIT = 3.0
-#: noise, and what it makes of the centres, is measured anew after so many slices, or when the mean square of residuals
-#: changes by this factor, or the flatness of a long spot by so much
-LAW_EVERY, LAW_CHANGE, LAW_FLATNESS = 64, 1.7, 0.15
+#: noise, and what it makes of the centres, is measured anew after so many slices, or when its sd changes by this factor
+#: (looked at when the mean square of residuals does by that), or the flatness of a long spot by so much
+LAW_EVERY, NOISE_CHANGE, LAW_CHANGE, LAW_FLATNESS = 64, 1.5, 1.7, 0.15
 #: structure about a spot is looked for when that mean square changes by this factor: by chance in one slice of ten;
 #: a streak that widens a centre (:data:`~ctreg_cli.imaging.uncertainty.SURE_OF_STRUCTURE`) changes it by more
 STRUCTURE_CHANGE = 1.5
@@ -206,14 +207,13 @@ class Follower:
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
-        changed = looks.have_changed(known, fitted)
-        is_due = self._law_age > LAW_EVERY or (changed is not None and (good & changed).any())
+        is_due = self._law_age > LAW_EVERY or looks.have_changed(known, fitted, good)
         if is_due:
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
         if is_due or looks.may_show_other_structure(known):
             known.surroundings(structure_near(fitted, known.law.rough, RADIUS_PX), looks)
-        covariance = known.law.scaled(known.unscaled, formal / known.formal)
+        covariance = known.law.scaled(known.unscaled, formal / known.formal, looks.misfit)
         good &= np.isfinite(covariance[:, 0, 0] + covariance[:, 1, 1])
         spots = Spots.of_own(
             uv_px=centre,
@@ -424,18 +424,25 @@ class _Looks(NamedTuple):
             other |= (known.structure > 0) & (change < 1.0 / STRUCTURE_CHANGE)
         return any(other.tolist())
 
-    def have_changed(self, known: _Known, fitted: Profiles) -> BoolArray | None:
-        """Whether (k,) things are no longer what they were when the law was measured; None where none has changed."""
-        change = self.misfit / known.misfit
-        ratios = change.tolist()
-        changed = None
-        if max(ratios) > LAW_CHANGE or min(ratios) < 1.0 / LAW_CHANGE:
-            changed = (change > LAW_CHANGE) | (change < 1.0 / LAW_CHANGE)
+    def have_changed(self, known: _Known, fitted: Profiles, good: BoolArray) -> bool:
+        """Whether noise, or the shape of a ``good`` (k,) spot, is no longer what it was when the law was measured.
+
+        Residuals change with noise, and with all else that is about a spot; where they do, the noise is looked at.
+        """
         if len(known.long):
             flatter = np.abs(fitted.parameters[FLATNESS] - known.flatness_then) > LAW_FLATNESS
-            flatter &= known.long.mask
-            changed = flatter if changed is None else changed | flatter
-        return changed
+            if (flatter & known.long.mask & good).any():
+                return True
+        change = self.misfit / known.misfit
+        ratios = change.tolist()
+        if max(ratios) < LAW_CHANGE and min(ratios) > 1.0 / LAW_CHANGE:
+            return False
+        rough, _, _ = noise_field(fitted.residuals, fitted.quiet, RADIUS_PX)
+        noisier = rough / known.law.rough
+        changed = ((noisier > NOISE_CHANGE) | (noisier < 1.0 / NOISE_CHANGE)) & good
+        if not changed.any():
+            known.misfit = self.misfit
+        return bool(changed.any())
 
 
 def _stepped(

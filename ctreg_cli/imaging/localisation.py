@@ -151,7 +151,7 @@ def fit_centres(blobs: Blobs, ceiling: float) -> Centres:
     """
     fitted = fit_profiles(blobs, ceiling)
     law = centre_law(fitted, centre_columns(fitted.normal), blobs.radius)
-    covariance = law.covariance(structure_near(fitted, law.rough, blobs.radius))
+    covariance = law.covariance(structure_near(fitted, law.rough, blobs.radius), _misfit(fitted.rows.by_spot))
     uv = fitted.centre.T
     away = ((uv - blobs.centre) ** 2).sum(axis=1)
     size = np.trace(blobs.moments, axis1=1, axis2=2)
@@ -377,23 +377,30 @@ class Law:
     faint: FloatArray
     #: (k, 2, 2) covariance that a perfect fit has as well, px²
     least: FloatArray
+    #: (k, 2, 2) px²: and what each unit by which the mean weighted square of residuals exceeds 1 adds; zero where
+    #: nothing is cut off
+    by_misfit: FloatArray
 
-    def covariance(self, structure: FloatArray) -> FloatArray:
-        """(k, 2, 2) px², for a ``structure`` of this variance (k,) about each spot."""
-        return self.scaled(self.made_by(structure), 1.0)
+    def covariance(self, structure: FloatArray, misfit: FloatArray) -> FloatArray:
+        """(k, 2, 2) px², for a ``structure`` of this variance (k,) about each spot and such residuals ``misfit`` (k,).
+
+        The latter are mean weighted squares.
+        """
+        return self.scaled(self.made_by(structure), 1.0, misfit)
 
     def made_by(self, structure: FloatArray) -> FloatArray:
         """(k, 2, 2) px²: what noise, and structure of these variances (k,), make of centres in sure windows."""
         structure = np.maximum(structure, self.texture)
         return centre_covariance(self.response, smooth=self.smooth, rough=self.rough, structure=structure)
 
-    def scaled(self, covariance: FloatArray, factor: FloatArray | float) -> FloatArray:
+    def scaled(self, covariance: FloatArray, factor: FloatArray | float, misfit: FloatArray) -> FloatArray:
         """That ``covariance`` (k, 2, 2) and all else.
 
         ``factor`` (k,) is by how much worse, in variance, the centres are known now than where the law was measured.
         """
         scaled: FloatArray = covariance * (self.faint * factor)[:, None, None]
         scaled += self.least
+        scaled += self.by_misfit * np.maximum(misfit - 1.0, 0.0)[:, None, None]
         return scaled
 
     def take(self, which: BoolArray | IntArray) -> Law:
@@ -405,6 +412,7 @@ class Law:
             texture=self.texture[which],
             faint=self.faint[which],
             least=self.least[which],
+            by_misfit=self.by_misfit[which],
         )
 
     def joined(self, other: Law) -> Law:
@@ -416,6 +424,7 @@ class Law:
             texture=np.concatenate([self.texture, other.texture]),
             faint=np.concatenate([self.faint, other.faint]),
             least=np.concatenate([self.least, other.least]),
+            by_misfit=np.concatenate([self.by_misfit, other.by_misfit]),
         )
 
 
@@ -442,9 +451,8 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
     response = responses(influence, radius, length)
     least = _of_pixels(fitted)[:, None, None] * np.eye(2)
     cut = np.flatnonzero(fitted.n_clipped)
-    if len(cut):
-        misfit = np.maximum(_misfit(by_spot[cut]) - 1.0, 0.0)
-        least[cut] += (MISFIT_SHARE * misfit * rough[cut] ** 2)[:, None, None] * response[1, cut]
+    by_misfit = np.zeros_like(least)
+    by_misfit[cut] = (MISFIT_SHARE * rough[cut] ** 2)[:, None, None] * response[1, cut]
     if len(long):
         least[long.index] += long.pair_covariance(fitted.parameters, by_spot, fitted.normal)
     # what metal strong enough to be cut off does to its surroundings is no texture: it is looked at next to the spot
@@ -457,6 +465,7 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
         texture=texture,
         faint=1.0 + (FAINT_SD * rough / fitted.height) ** 3,
         least=least,
+        by_misfit=by_misfit,
     )
 
 
