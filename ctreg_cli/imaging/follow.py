@@ -2,7 +2,7 @@
 
 The centre always comes from the pixels of the slice at hand. What is kept from slice to slice is what the fit starts
 from (:mod:`.profile`: height, shape, background) and the weights of its pixels; from there one Gauss–Newton step ends
-within a small part of the noise of where the full fit ends. Its covariance follows the law of :mod:`.localisation`:
+within a small part of the noise of where the full fit ends. Its covariance follows the law of :mod:`.law`:
 noise, and structure about the spot, are measured every few slices and when residuals change. Whatever is not plainly
 what it was is measured as in :func:`.segmentation.measure_spots`.
 """
@@ -28,23 +28,20 @@ from ctreg_cli.imaging.blob import (
     monomials,
 )
 from ctreg_cli.imaging.fit import FLATNESS_RANGE, LONG_FLATNESS_PRIOR, PRIOR
-from ctreg_cli.imaging.localisation import (
+from ctreg_cli.imaging.law import Law, centre_columns, centre_law, structure_near
+from ctreg_cli.imaging.peaks import rate_peaks
+from ctreg_cli.imaging.plateau import LONG_RATIO, LongSpots
+from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
+from ctreg_cli.imaging.profiles import (
     NEAR_PX,
     NOISE_BEYOND_PX,
     START_LEVEL,
     START_LOG_BETA,
-    Law,
     Profiles,
-    centre_columns,
-    centre_law,
     distance_beyond_edge,
     fit_profiles,
     root_pixel_weights,
-    structure_near,
 )
-from ctreg_cli.imaging.peaks import rate_peaks
-from ctreg_cli.imaging.plateau import LONG_RATIO, LongSpots
-from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SMOOTHING_LOSS, SegmentationOptions, measure_spots
 from ctreg_cli.imaging.slice import Slice
 from ctreg_cli.imaging.spots import Spots
@@ -253,7 +250,7 @@ class _Known:
     #: (k,) what lies above this value is the spot and nothing else; and half of its height
     level: FloatArray
     half: FloatArray
-    #: (k,) what pixels are weighted by, as in :class:`~ctreg_cli.imaging.localisation.Profiles`
+    #: (k,) what pixels are weighted by, as in :class:`~ctreg_cli.imaging.profiles.Profiles`
     noise: FloatArray
     structure_slope: FloatArray
     #: value at which the image is cut off
@@ -266,7 +263,7 @@ class _Known:
     beside: FloatArray
     flatness_then: FloatArray
     #: variance (k,) of structure about the centres, and how large residuals were when it was looked for; what it and
-    #: noise make of the centres (k, 2, 2), see :meth:`~ctreg_cli.imaging.localisation.Law.made_by`
+    #: noise make of the centres (k, 2, 2), see :meth:`~ctreg_cli.imaging.law.Law.made_by`
     structure: FloatArray
     misfit_then: FloatArray
     unscaled: FloatArray

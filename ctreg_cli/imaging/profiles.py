@@ -1,0 +1,378 @@
+"""Profiles of spots, fitted to all windows at once.
+
+The profile of :mod:`.profile` is fitted (:mod:`.fit`) with pixels weighted by what can be wrong with them: noise
+everywhere, and structure of the background (streaks, plate edges) that grows with the distance from the blob. Spots
+that come out sharp or flat are fitted again with the profile that is made for them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.imaging.blob import Blobs, axes_of, inverse_elements
+from ctreg_cli.imaging.fit import fit
+from ctreg_cli.imaging.plateau import LongSpots, rod_flatness
+from ctreg_cli.imaging.profile import (
+    BACKGROUND,
+    CENTRE,
+    FLATNESS,
+    LOG_HEIGHT,
+    LONG_BETA,
+    N_PARAMETERS,
+    SHAPE,
+    Areas,
+    Rows,
+    moments_of_shape,
+)
+from ctreg_cli.imaging.uncertainty import ring_spread
+from ctreg_cli.imaging.window import dilated, disc, grid
+
+#: background structure is correlated over a few pixels, which count as one: so its sd counts twice
+STRUCTURE_WEIGHT = 2.0
+#: how far beyond the blob's edge the structure that disturbs it is looked at, and from where on the pixel noise, px
+NEAR_PX, NOISE_BEYOND_PX = (1.0, 4.0), 2.0
+#: another blob that begins within this of the edge touches the spot: it is left out of the fit, not of the covariance
+TOUCHING_PX = 2.0
+#: weight of what is left out of a fit, over that of the rest: not zero, so that its residuals can be looked at
+LEFT_OUT = 1e-12
+#: where an edge falls by more of the height in a pixel, or one that is cut off by more of the ceiling, pixels are means
+#: over their areas; as far as this beyond half height, px
+SHARP, SHARP_CUT, SHARP_REACH_PX = 0.7, 2.2, 2.0
+#: a top flatter than this (ln β) is not one that the common fit foresees
+FLAT, FLAT_CUT = 0.6, 0.2
+#: one that is cut off may be an edge as well where its mean weighted square of residuals is more than this
+POOR = 3.0
+#: by what share of the height its edge falls in a pixel, to start from
+FLAT_EDGE = 0.4
+#: fewer pixels above half height do not tell whether a spot is long; if it is taken for a long one, is nearly as steep,
+#: and its mean weighted square of residuals is more than noise would make it, it is fitted in that way too
+COARSE_PX2, SHARP_COARSE, COARSE_MISFIT = 10.0, 0.6, 1.15
+#: what is cut off is seen so only if that lowers its mean weighted square of residuals to this share
+CLEARLY_BETTER = 0.95
+#: of a spot that is cut off the common profile tells enough up to this half width, px; beyond, an edge about a flat top
+#: fits better
+RIM_PX = 2.5
+#: added to a blob's second moments to start from: the region of a sharp spot is one pixel, the spot is wider, px²
+START_BLUR_PX2 = 0.1
+#: start of ln β, between a Gaussian and a flat top
+START_LOG_BETA = 0.15
+#: of sharp spots
+SHARP_START_LOG_BETA = 0.3
+#: height over which a centre to start from is taken, in spot heights: background and its gradient do not reach there
+START_LEVEL = 0.3
+#: bounds for the first guess of a clipped spot's true height: of the share that is flat, and of log2 (true / seen)
+MAX_FLAT_SHARE, MIN_LOG2_OVER = 0.7, 0.1
+
+
+class Profiles(NamedTuple):
+    """Profiles fitted to ``k`` blobs; ``p`` pixels in the disc of each window."""
+
+    #: (10, k); long spots are seen along their own axes
+    parameters: FloatArray
+    long: LongSpots
+    #: (2, k) from the windows' middles, px
+    centre: FloatArray
+    #: (k, 10, 10), of the steps of :func:`ctreg_cli.imaging.profile.moved`
+    normal: FloatArray
+    #: derivatives and weighted residuals at ``parameters``
+    rows: Rows
+    #: (k, p) residuals, not weighted
+    residuals: FloatArray
+    #: (k,) sd of the noise by which pixels were weighted, and by how much structure adds to that a pixel farther out
+    noise: FloatArray
+    structure_slope: FloatArray
+    #: (k, p) where the structure that disturbs a blob is looked at, and where the pixel noise
+    near: BoolArray
+    quiet: BoolArray
+    #: (k,) height of the blobs, as far as it is not cut off, and how many of their pixels are
+    height: FloatArray
+    n_clipped: IntArray
+    #: (k,) of which profiles pixels were taken as means over their areas
+    sharp: BoolArray
+    #: (k,) which profiles are edges about flat tops
+    flat: BoolArray
+    #: value at which the image is cut off
+    ceiling: float
+
+
+def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
+    """Fit the profile to every blob; arguments as :func:`fit_centres`."""
+    k = len(blobs)
+    at = disc(blobs.radius)
+    u, v = (axis.ravel()[at] for axis in grid(blobs.radius))
+    values = blobs.values.reshape(k, -1)[:, at]
+    usable = ~np.isnan(values)
+    if not usable.all():
+        values = np.where(usable, values, blobs.background[:, None])
+    distance = distance_beyond_edge(blobs.moments, u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None])
+    near = (distance > NEAR_PX[0]) & (distance < NEAR_PX[1]) & usable
+    if blobs.foreign.any():
+        foreign = dilated(blobs.foreign).reshape(k, -1)[:, at] & usable
+        near = (near & ~foreign) | (foreign & (distance < TOUCHING_PX))
+        usable &= ~foreign
+    clipped, n_clipped = _clipped(values, blobs.own.reshape(k, -1)[:, at], ceiling)
+
+    noise, structure = ring_spread(blobs)
+    reach = np.maximum(blobs.radius - np.sqrt(blobs.area / np.pi), 1.0)
+    structure_slope = STRUCTURE_WEIGHT * structure / reach
+    root_weights = root_pixel_weights(distance, noise, structure_slope)
+    if not usable.all():
+        root_weights = np.where(usable, root_weights, math.sqrt(LEFT_OUT) * root_weights)
+
+    brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
+    long = LongSpots.of(blobs)
+    rows = _rows(u, v, values, clipped, root_weights, long)
+    parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
+    sharp = _is_sharp(blobs, parameters, rows, long, n_clipped > 0, ceiling)
+    few = np.flatnonzero(sharp)
+    if len(few):
+        clipped_few = None if clipped is None else clipped[few]
+        part = values[few], clipped_few, root_weights[few]
+        first = np.where(long.mask, _start(blobs, n_clipped, brightest, LongSpots.none(k)), parameters)
+        of_few = _fit_sharp(blobs.take(few), u, v, *part, n_clipped[few], brightest[:, few], first[:, few])
+        # of what is cut off (one pixel of every image is the brightest), and neither way explains (a sharp kernel's
+        # undershoot), the common fit is the steadier one
+        least = np.where(n_clipped[few] > 1, CLEARLY_BETTER, np.inf) * misfit_of(rows.by_spot[few])
+        better = misfit_of(of_few[2]) < least
+        few = few[better]
+        parameters[:, few], normal[few], rows.by_spot[few] = of_few[0][:, better], of_few[1][better], of_few[2][better]
+        long = long.replaced(few, of_few[3].take(better))
+        sharp[:] = False
+        sharp[few] = True
+    flat = np.zeros(k, dtype=bool)
+    is_poor = misfit_of(rows.by_spot) > POOR
+    may_be_flat = (n_clipped > 0) & ((parameters[FLATNESS] > FLAT_CUT) | is_poor)
+    may_be_flat |= parameters[FLATNESS] > FLAT
+    few = np.flatnonzero(may_be_flat & ~long.mask & (blobs.area > np.pi * RIM_PX**2))
+    if len(few):
+        clipped_few = None if clipped is None else clipped[few]
+        part = values[few], clipped_few, root_weights[few]
+        first = _flat_start(parameters[:, few], blobs.take(few), n_clipped[few] > 0)
+        edges, edges_normal, by_spot = _fit_flat(u, v, *part, first, blobs.radius)
+        better = misfit_of(by_spot) < misfit_of(rows.by_spot[few])
+        few = few[better]
+        parameters[:, few], normal[few], rows.by_spot[few] = edges[:, better], edges_normal[better], by_spot[better]
+        flat[few] = True
+    return Profiles(
+        parameters=parameters,
+        long=long,
+        centre=long.turned_back(parameters[CENTRE]),
+        normal=normal,
+        rows=rows,
+        residuals=rows.by_spot[:, -1] / root_weights,
+        noise=noise,
+        structure_slope=structure_slope,
+        near=near,
+        quiet=usable & (distance > NOISE_BEYOND_PX),
+        height=blobs.height,
+        n_clipped=n_clipped,
+        sharp=sharp,
+        flat=flat,
+        ceiling=ceiling,
+    )
+
+
+def _rows(
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    long: LongSpots,
+    areas: Areas | None = None,
+) -> Rows:
+    """:class:`.profile.Rows` of windows of which some show ``long`` spots, seen along their own axes."""
+    if not len(long):
+        return Rows(u, v, values, clipped, root_weights, areas=areas)
+    along, across = long.coordinates(u, v)
+    return Rows(along, across, values, clipped, root_weights, long.mask, areas)
+
+
+def misfit_of(by_spot: FloatArray) -> FloatArray:
+    """Mean weighted squares (k,) of residuals, the last of the rows (k, 11, p)."""
+    return np.asarray((by_spot[:, -1] ** 2).mean(axis=1))
+
+
+def _is_sharp(
+    blobs: Blobs, parameters: FloatArray, rows: Rows, long: LongSpots, clipped: BoolArray, ceiling: float
+) -> BoolArray:
+    """Whether (k,) pixels are too wide to be seen as points of a fitted profile.
+
+    Or whether a spot of few pixels was taken for a long one, and does not look like that.
+    """
+    at_edge, at_ceiling = steepness(parameters, long.mask, ceiling)
+    sharp = (at_edge > SHARP) | (clipped & (at_ceiling > SHARP_CUT))
+    coarse = long.index[blobs.area[long.index] < COARSE_PX2]
+    sharp[coarse] |= (at_edge[coarse] > SHARP_COARSE) & (misfit_of(rows.by_spot[coarse]) > COARSE_MISFIT)
+    return np.asarray(sharp)
+
+
+def _reach(parameters: FloatArray, radius: int) -> float:
+    """How far from the middles of windows of this radius profiles are so steep that pixels are no points, px."""
+    half_axes = 0.5 * axes_of(moments_of_shape(parameters))[0]
+    return SHARP_REACH_PX + float(np.minimum(half_axes, radius).max())
+
+
+def _flat_start(parameters: FloatArray, blobs: Blobs, clipped: BoolArray) -> FloatArray:
+    """Parameters (10, k) to start from: those of another profile, or of what is cut off, a rod half of which is seen.
+
+    Of a thick rod the rim alone is seen there, which lies near the half-height contour whatever the height.
+    """
+    uu, uv, vv = inverse_elements(4.0 * blobs.moments)
+    start, l_vv = parameters.copy(), np.sqrt(vv)
+    shape = np.stack([0.5 * np.log(uu - uv * uv / vv), uv / l_vv, np.log(l_vv)])
+    start[SHAPE] = np.where(clipped, shape, parameters[SHAPE])
+    start[LOG_HEIGHT] = np.where(clipped, np.log(2.0 * blobs.height), parameters[LOG_HEIGHT])
+    steep = -np.log(np.log(2.0)) - 0.5 * (shape[0] + shape[2]) + np.log(FLAT_EDGE)
+    start[FLATNESS] = np.where(clipped, np.maximum(steep, FLAT), parameters[FLATNESS])
+    return start
+
+
+def _fit_flat(
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    first: FloatArray,
+    radius: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit edges about flat tops, from the ``first`` parameters (10, k); else as :func:`_fit_sharp`."""
+    rows = Rows(u, v, values, clipped, root_weights, flat=True)
+    steep = np.log(2.0) * np.exp(first[FLATNESS] + np.maximum(first[SHAPE][0], first[SHAPE][2])) > SHARP
+    if clipped is not None or steep.any():
+        areas, points_u, points_v = Areas.within(u, v, _reach(first, radius))
+        rows = Rows(points_u, points_v, values, clipped, root_weights, areas=areas, flat=True)
+    parameters, normal = fit(rows, first)
+    return parameters, normal, rows.by_spot
+
+
+def _fit_sharp(
+    blobs: Blobs,
+    u: FloatArray,
+    v: FloatArray,
+    values: FloatArray,
+    clipped: BoolArray | None,
+    root_weights: FloatArray,
+    n_clipped: IntArray,
+    brightest: FloatArray,
+    first: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, LongSpots]:
+    """Fit profiles to pixels that are means over their areas.
+
+    Which spots are long tells their fitted shape: few pixels above half height do not.
+
+    Args:
+        blobs: the windows.
+        u: (p,) coordinates of their pixels.
+        v: likewise.
+        values: (k, p).
+        clipped: (k, p) which of these are cut off, if any is.
+        root_weights: (k, p).
+        n_clipped: (k,) how many of the blobs' own are cut off.
+        brightest: (2, k) centres to start from.
+        first: (10, k) parameters of spots that are not long, to start from.
+
+    Returns:
+        Parameters (10, k), normal matrices (k, 10, 10), derivatives and residuals (k, 11, p), and what is long.
+    """
+    areas, points_u, points_v = Areas.within(u, v, _reach(first, blobs.radius))
+    long = LongSpots.none(len(blobs))
+    rows = _rows(points_u, points_v, values, clipped, root_weights, long, areas)
+    start = first.copy()
+    start[FLATNESS] = SHARP_START_LOG_BETA
+    parameters, normal = fit(rows, start)
+    shown = LongSpots.of_moments(moments_of_shape(parameters))
+    if len(shown):
+        few = shown.index
+        long = shown.take(few)
+        clipped = None if clipped is None else clipped[few]
+        again = _rows(points_u, points_v, values[few], clipped, root_weights[few], long, areas)
+        start = _start(blobs.take(few), n_clipped[few], brightest[:, few], long)
+        parameters[:, few], normal[few] = fit(again, start)
+        rows.by_spot[few] = again.by_spot
+    return parameters, normal, rows.by_spot, shown
+
+
+def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolArray | None, IntArray]:
+    """Which pixels (k, p) are cut off, None if none is, and how many (k,) of each blob's own."""
+    clipped = values >= ceiling
+    n_clipped = np.count_nonzero(clipped & own, axis=1)
+    return (clipped if n_clipped.any() else None), n_clipped
+
+
+def steepness(parameters: FloatArray, long: BoolArray, ceiling: float) -> tuple[FloatArray, FloatArray]:
+    """By what share (k,) of the height profiles fall in a pixel at half height; of the ceiling, where they reach it."""
+    width = np.exp(-np.maximum(parameters[SHAPE][0], parameters[SHAPE][2]))
+    beta = np.where(long, LONG_BETA, np.exp(parameters[FLATNESS]))
+    at_edge = np.log(2.0) * beta / width
+    # 2^(−q^β) is the ceiling over the height where q^β is this
+    at_ceiling = (parameters[LOG_HEIGHT] - np.log(np.maximum(ceiling - parameters[BACKGROUND], 1e-9))) / np.log(2.0)
+    return at_edge, at_edge * 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
+
+
+def distance_beyond_edge(moments: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance (k, p) of points outside the uniform ellipses with these second moments, px; 0 inside.
+
+    Args:
+        moments: (k, 2, 2) px².
+        x: (k, p) from the ellipse's middle, px.
+        y: likewise.
+    """
+    uu, uv, vv = inverse_elements(4.0 * moments)  # such an ellipse has a quarter of its semi-axes squared
+    xx, yy = x * x, y * y
+    q = uu[:, None] * xx
+    q += vv[:, None] * yy
+    xy = x * y
+    xy *= 2.0 * uv[:, None]
+    q += xy
+    xx += yy
+    distance = np.sqrt(xx)
+    distance -= np.sqrt(xx / np.maximum(q, 1e-18))
+    return np.maximum(distance, 0.0, out=distance)
+
+
+def root_pixel_weights(distance: FloatArray, noise: FloatArray, structure_slope: FloatArray) -> FloatArray:
+    """Roots of the weights (k, p) of pixels so far beyond an edge: noise (k,) everywhere, and structure that grows."""
+    spread = structure_slope[:, None] * distance
+    spread *= spread
+    spread += (noise * noise)[:, None]
+    np.sqrt(spread, out=spread)
+    return np.asarray(1.0 / spread)
+
+
+def _brightest(blobs: Blobs, values: FloatArray, about: BoolArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Centre of gravity (2, k) of what stands out of the background, taken high enough that it does not count."""
+    weights = values - (blobs.background + START_LEVEL * blobs.height)[:, None]
+    np.maximum(weights, 0.0, out=weights)
+    weights *= about
+    sums: FloatArray = np.stack([u, v, np.ones(len(u))]) @ weights.T
+    centre: FloatArray = sums[:2] / sums[2]
+    return centre
+
+
+def _start(blobs: Blobs, n_clipped: IntArray, centre: FloatArray, long: LongSpots) -> FloatArray:
+    """First parameters (10, k) from the blob's moments, the number (k,) of its pixels cut off, and its ``centre``.
+
+    Of a clipped blob the true height shows in how much of it is flat: for a Gaussian of height a·h cut off at h the
+    flat part covers ``log2 a / (1 + log2 a)`` of what lies above h/2.
+    """
+    flat = np.minimum(n_clipped / blobs.area, MAX_FLAT_SHARE)
+    log2_over = np.maximum(flat / (1.0 - flat), MIN_LOG2_OVER)
+    moments = long.turned_moments(blobs.moments) + START_BLUR_PX2 * np.eye(2)
+    uu, uv, vv = inverse_elements(4.0 * moments)
+    wider = (1.0 + log2_over) ** np.exp(-START_LOG_BETA)
+    l_vv = np.sqrt(vv * wider)
+    l_uv = uv * wider / l_vv
+    start = np.zeros((N_PARAMETERS, len(blobs)))
+    start[CENTRE] = long.turned(centre)
+    start[LOG_HEIGHT] = log2_over * np.log(2.0) + np.log(blobs.height)
+    start[BACKGROUND] = blobs.background
+    start[SHAPE] = 0.5 * np.log(uu * wider - l_uv * l_uv), l_uv, np.log(l_vv)
+    start[FLATNESS] = START_LOG_BETA
+    start[FLATNESS, long.index] = rod_flatness(np.sqrt(moments[:, 0, 0] / moments[:, 1, 1])[long.index])
+    return start
