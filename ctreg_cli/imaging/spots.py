@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 DEFAULT_SPOT_SD_PX = 0.25
 
 _ARRAYS = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
-_MEASURED: dict[str, object] = {"sd_assumed": False, "rejected": (), "n_rejected": MappingProxyType({})}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +80,7 @@ class Spots:
         for name, values in arrays.items():
             values.flags.writeable = False
             object.__setattr__(spots, name, values)
-        for name, value in _MEASURED.items():
+        for name, value in (("sd_assumed", False), ("rejected", ()), ("n_rejected", {})):
             object.__setattr__(spots, name, value)
         return spots
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 
 import numpy as np
@@ -175,6 +176,17 @@ def test_more_noise_is_owned_up_to_at_once(monkeypatch: pytest.MonkeyPatch) -> N
         slice_, uv, expected = next(moving("thin rod", rng, 1))
         own.append(in_own_variances(matched(follower.measure(slice_, RODS, expected, RADIUS_PX), uv), uv))
     assert 0.65 < np.mean(own[4:]) < 1.2
+
+
+def test_followed_spots_are_values_as_others_are() -> None:
+    rng = np.random.default_rng(14)
+    spots = knowing(rng).measure(one(rng), ONE, UV, np.array([4.0]))
+    again = pickle.loads(pickle.dumps(spots))
+    for name in ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad"):
+        values = getattr(spots, name)
+        assert not values.flags.writeable
+        np.testing.assert_array_equal(getattr(again, name), values)
+    assert (again.sd_assumed, again.rejected, again.n_rejected) == (False, (), {})
 
 
 def test_nothing_is_seen_where_nothing_is_any_more() -> None:
