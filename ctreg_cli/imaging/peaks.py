@@ -98,12 +98,11 @@ def _middles_of_tops(image: UprightImage, pixels: IntArray, reach: int) -> IntAr
 
 def large_regions(smooth: NDArray[Any], level: float, least_px: float) -> FloatArray:
     """Boxes (m, 4) = (u, v from, u, v to) of bright regions wider and higher than ``least_px``, on a coarse grid."""
-    from scipy.ndimage import find_objects, label
+    from skimage import measure
 
-    labels, _ = label(smooth[::COARSE_PX, ::COARSE_PX] > level)
-    boxes = [
-        (columns.start, rows.start, columns.stop - 1, rows.stop - 1)
-        for rows, columns in find_objects(labels)
-        if min(columns.stop - columns.start, rows.stop - rows.start) * COARSE_PX > least_px
-    ]
-    return COARSE_PX * np.array(boxes, dtype=np.float64).reshape(-1, 4)
+    find: Any = measure  # it comes without types
+    regions = find.regionprops(find.label(smooth[::COARSE_PX, ::COARSE_PX] > level, connectivity=1))
+    boxes = np.array([region.bbox for region in regions], dtype=np.intp).reshape(-1, 4)  # rows and columns, half open
+    first, last = boxes[:, 1::-1], boxes[:, :1:-1] - 1
+    is_large = (last - first + 1).min(axis=1) * COARSE_PX > least_px
+    return np.asarray(COARSE_PX * np.hstack([first, last])[is_large], dtype=np.float64)
