@@ -29,6 +29,7 @@ from ctreg_cli.imaging.blob import (
 )
 from ctreg_cli.imaging.fit import FLATNESS_RANGE, LONG_FLATNESS_PRIOR, PRIOR
 from ctreg_cli.imaging.law import Law, centre_columns, centre_law, structure_near
+from ctreg_cli.imaging.localisation import are_masks
 from ctreg_cli.imaging.peaks import rate_peaks
 from ctreg_cli.imaging.plateau import LONG_RATIO, LongSpots
 from ctreg_cli.imaging.profile import BACKGROUND, CENTRE, FLATNESS, LOG_HEIGHT, N_PARAMETERS, SHAPE, Rows, moved
@@ -158,7 +159,8 @@ class Follower:
             blobs, learned = blobs.take(lone), rods[due][lone]
             if len(learned):
                 fitted = fit_profiles(blobs, image.ceiling)
-                smooth = ~(fitted.sharp | fitted.flat)  # of the others a step is not worth more than a fit
+                # of the others a step is not worth more than a fit
+                smooth = ~(fitted.sharp | fitted.flat | are_masks(blobs))
                 if not smooth.all():
                     blobs, learned = blobs.take(smooth), learned[smooth]
                     fitted = fit_profiles(blobs, image.ceiling)

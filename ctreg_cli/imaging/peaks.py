@@ -19,6 +19,8 @@ BLOCK_PX = 16
 COARSE_PX = 4
 #: samples on each ring, and each ring's radius over the last one's
 RING_SAMPLES, RING_RATIO = 16, 1.3
+#: an image whose pixels differ from their neighbours in no more than this share shows no noise
+LEAST_NOISY = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -38,11 +40,16 @@ class Peaks:
 
 
 def image_noise(image: NDArray[Any]) -> float:
-    """Sd of the pixel noise of an image by the median Laplacian of every eighth row; flat (clipped) air is left out."""
+    """Sd of the pixel noise of an image by the median Laplacian of every eighth row; flat (clipped) air is left out.
+
+    Where nearly all is flat there is no noise to be seen: what is not are the edges of a mask.
+    """
     inner = image[1:-1:8, 1:-1]
     laplacian = 4 * inner - image[:-2:8, 1:-1] - image[2::8, 1:-1] - image[1:-1:8, :-2] - image[1:-1:8, 2:]
     size = np.abs(laplacian[np.isfinite(laplacian) & (laplacian != 0)])
-    return float(1.4826 * np.median(size) / np.sqrt(20.0)) if size.size else 0.0
+    if size.size <= LEAST_NOISY * laplacian.size:
+        return 0.0
+    return float(1.4826 * np.median(size) / np.sqrt(20.0))
 
 
 def maxima_above(smooth: NDArray[Any], margin: float) -> tuple[IntArray, IntArray]:

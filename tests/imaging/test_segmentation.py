@@ -383,3 +383,20 @@ def test_the_rods_of_the_model_say_how_thick_a_spot_may_be() -> None:
     assert expecting(model(1.0, None, 1.5), None).rod_diameter_mm is None
     given = SegmentationOptions(rod_diameter_mm=(3.0, 4.0))
     assert expecting(model(1.0, 2.0, 1.5), given) is given
+
+
+@pytest.mark.parametrize("radius_px", [2.0, 3.0, 4.0, 6.0])
+def test_of_a_mask_all_spots_are_found_and_their_covariance_is_that_of_its_rim(radius_px: float) -> None:
+    """Pixels that only say in or out: centres are known to 1 / (12 π r) px², and nothing is taken for noise."""
+    rng = np.random.default_rng([41, int(radius_px)])
+    row, column = np.mgrid[:160, :160]
+    squares = []
+    for _ in range(12):
+        uv = np.array([(30.0 + 45 * i, 30.0 + 45 * j) for i in range(3) for j in range(3)]) + rng.uniform(-3, 3, (9, 2))
+        inside = (np.hypot(column - uv[:, :1, None], row - uv[:, 1:, None]) < radius_px).any(axis=0)
+        spots = find_spots(Slice(info=SliceInfo(source="mask.png"), stored=np.where(inside, 255, 0).astype(np.uint8)))
+        assert len(spots) == len(uv)
+        nearest = np.linalg.norm(spots.uv_px[:, None] - uv, axis=2).argmin(axis=0)
+        error = spots.uv_px[nearest] - uv
+        squares.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(spots.covariance_px[nearest]), error) / 2)
+    assert 0.7 < np.mean(squares) < 1.35
