@@ -35,7 +35,6 @@ from ctreg_cli.registration.labelled import register_labelled
 from ctreg_cli.registration.matching import doubt, search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
-from ctreg_cli.registration.result import Registration
 from ctreg_cli.registration.twins import with_twins
 from ctreg_cli.rods import Mount, Rod, RodModel, Target
 from ctreg_cli.scale import Scale
@@ -50,6 +49,7 @@ from tests.oracle import (
     scene,
     twist_error,
 )
+from tests.registration.frames import on_its_mount
 
 #: odds beyond which a scene is decidable, and sds of the bound beyond which an ``ok`` is wrong
 DECIDABLE, WRONG_SD = math.log(100), 6.0
@@ -586,26 +586,16 @@ def table_wrong_model(share: float, seed: int) -> None:
             rng = np.random.default_rng([seed, axis, len(name)])
             stretch = np.where(np.arange(2) == axis, 1.02, 1.0)
             for _ in range(max(20, int(200 * share))):
-                result, R = _mounted_slice(mounted, rng, stretch)
+                R, xy_mm = on_its_mount(mounted, rng)
+                uv = xy_mm / 0.5 + rng.normal(0.0, 0.1, xy_mm.shape)
+                s_x, s_y = (0.5 * stretch).tolist()
+                result = register(Spots.from_points(uv, 0.1), mounted, scale=Scale(s_x=s_x, s_y=s_y))
                 tally[result.status if result.status != "no_pose" else result.reason] += 1
                 if result.status == "ok":
                     best = result.candidates[0]
                     turn = Rotation.from_matrix(best.T_slice_model[:3, :3] @ R.T).as_rotvec()
                     tally["not covered"] += bool(turn @ np.linalg.inv(best.covariance[3:, 3:]) @ turn > 36)
         print(f"{name}, the scale of one axis wrong by 2 %, seed {seed}: {dict(tally)}")
-
-
-def _mounted_slice(model: RodModel, rng: np.random.Generator, stretch: np.ndarray) -> tuple[Registration, np.ndarray]:
-    """All spots of a frame on its mount, at scales that are told ``stretch`` times too large; and its true rotation."""
-    R = Rotation.from_rotvec(rng.normal(0.0, np.radians([6.0, 6.0, 10.0]))).as_matrix()
-    if model.mount is not None:
-        R = R @ np.array(model.mount.patient_from_model, dtype=np.float64)
-    t = np.array([128.0, 128.0, 0.0]) - R @ (model.centre + rng.uniform(-40.0, 40.0) * np.array([0.0, 0.0, 1.0]))
-    a, b = model.starts @ R.T + t, model.ends @ R.T + t
-    xy_mm = cross_lines(model.starts, model.ends, R, t)[a[:, 2] * b[:, 2] < 0]
-    uv = xy_mm / 0.5 + rng.normal(0.0, 0.1, xy_mm.shape)
-    s_x, s_y = (0.5 * stretch).tolist()
-    return register(Spots.from_points(uv, 0.1), model, scale=Scale(s_x=s_x, s_y=s_y)), R
 
 
 def table_leksell(share: float, seed: int) -> None:

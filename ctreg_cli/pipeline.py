@@ -345,8 +345,7 @@ def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
     scale = override or item.info.scale
     if scale is None:
         raise MissingScaleError(
-            f"{item.info.source or 'spots'}: no pixel scale in the input; "
-            "give --scale SX SY (mm per pixel) or -c CALIBRATION"
+            f"{item.info.name}: no pixel scale in the input; give --scale SX SY (mm per pixel) or -c CALIBRATION"
         )
     return scale
 

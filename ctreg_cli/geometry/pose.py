@@ -62,12 +62,7 @@ def exp_rotation(omega_rad: FloatArray) -> FloatArray:
 def update(T: FloatArray, twist: FloatArray) -> FloatArray:
     """Pose after the twist ``[V; Ω]`` (..., 6), mm and rad: ``R ← exp([Ω]ₓ) R``, ``t ← t + V`` (eq. 16 integrated)."""
     twist = np.asarray(twist, dtype=np.float64)
-    R = exp_rotation(twist[..., 3:]) @ T[..., :3, :3]
-    moved: FloatArray = np.empty((*R.shape[:-2], 4, 4))
-    moved[...] = T
-    moved[..., :3, :3] = R
-    moved[..., :3, 3] += twist[..., :3]
-    return moved
+    return make_pose(exp_rotation(twist[..., 3:]) @ T[..., :3, :3], T[..., :3, 3] + twist[..., :3])
 
 
 def difference(T_to: FloatArray, T_from: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ def project(T: FloatArray, points: FloatArray, directions: FloatArray) -> Projec
     )
 
 
-def within_bounds(lambda_mm: FloatArray, lengths: FloatArray, slack_mm: float = 0.0) -> BoolArray:
+def within_bounds(lambda_mm: FloatArray, lengths: FloatArray, slack_mm: FloatArray | float = 0.0) -> BoolArray:
     """Whether the slice cuts the rod itself and not only its line: ``−slack ≤ λ ≤ length + slack`` (eq. 3)."""
     inside: BoolArray = (lambda_mm >= -slack_mm) & (lambda_mm <= lengths + slack_mm)
     return inside

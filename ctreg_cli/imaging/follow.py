@@ -41,6 +41,7 @@ from ctreg_cli.imaging.profiles import (
     Profiles,
     distance_beyond_edge,
     fit_profiles,
+    misfit_of,
     root_pixel_weights,
 )
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SMOOTHING_LOSS, SegmentationOptions, measure_spots
@@ -206,7 +207,12 @@ class Follower:
 
         formal = _formal_variance(fitted.parameters, shift)
         self._law_age += 1
-        is_due = self._law_age > LAW_EVERY or looks.have_changed(known, fitted, good)
+        is_due = self._law_age > LAW_EVERY or known.is_shaped_otherwise(fitted, good)
+        if not is_due and looks.have_changed(known):
+            # with noise, or with something else that is about a spot
+            is_due = known.is_in_other_noise(fitted, good)
+            if not is_due:
+                known.misfit = looks.misfit
         if is_due:
             self._law_age = 0
             known.measured(centre_law(fitted, shift, RADIUS_PX), formal, looks, fitted)
@@ -306,6 +312,19 @@ class _Known:
         limit: FloatArray = np.minimum(np.maximum(LONE_SPREADS * self.law.rough, least * height), most * height)
         return limit
 
+    def is_shaped_otherwise(self, fitted: Profiles, good: BoolArray) -> bool:
+        """Whether a ``good`` (k,) long spot is flatter, or less flat, than when the law was measured."""
+        if not len(self.long):
+            return False
+        flatter = np.abs(fitted.parameters[FLATNESS] - self.flatness_then) > LAW_FLATNESS
+        return bool((flatter & self.long.mask & good).any())
+
+    def is_in_other_noise(self, fitted: Profiles, good: BoolArray) -> bool:
+        """Whether the noise about a ``good`` (k,) spot is no longer what it was when the law was measured."""
+        rough, _, _ = noise_field(fitted.residuals, fitted.quiet, RADIUS_PX)
+        noisier = rough / self.law.rough
+        return bool((((noisier > NOISE_CHANGE) | (noisier < 1.0 / NOISE_CHANGE)) & good).any())
+
     def measured(self, law: Law, formal: FloatArray, looks: _Looks, fitted: Profiles) -> None:
         """Remember the law, and what it was measured with.
 
@@ -398,10 +417,9 @@ class _Looks(NamedTuple):
 
     @classmethod
     def of(cls, fitted: Profiles) -> _Looks:
-        weighted = fitted.rows.by_spot[:, -1]
         return cls(
             height=fitted.height,
-            misfit=(weighted * weighted).sum(axis=1) / weighted.shape[1],
+            misfit=misfit_of(fitted.rows.by_spot),
             beside=np.where(fitted.quiet, fitted.residuals, -np.inf).max(axis=1),
         )
 
@@ -423,25 +441,10 @@ class _Looks(NamedTuple):
             other |= (known.structure > 0) & (change < 1.0 / STRUCTURE_CHANGE)
         return any(other.tolist())
 
-    def have_changed(self, known: _Known, fitted: Profiles, good: BoolArray) -> bool:
-        """Whether noise, or the shape of a ``good`` (k,) spot, is no longer what it was when the law was measured.
-
-        Residuals change with noise, and with all else that is about a spot; where they do, the noise is looked at.
-        """
-        if len(known.long):
-            flatter = np.abs(fitted.parameters[FLATNESS] - known.flatness_then) > LAW_FLATNESS
-            if (flatter & known.long.mask & good).any():
-                return True
-        change = self.misfit / known.misfit
-        ratios = change.tolist()
-        if max(ratios) < LAW_CHANGE and min(ratios) > 1.0 / LAW_CHANGE:
-            return False
-        rough, _, _ = noise_field(fitted.residuals, fitted.quiet, RADIUS_PX)
-        noisier = rough / known.law.rough
-        changed = ((noisier > NOISE_CHANGE) | (noisier < 1.0 / NOISE_CHANGE)) & good
-        if not changed.any():
-            known.misfit = self.misfit
-        return bool(changed.any())
+    def have_changed(self, known: _Known) -> bool:
+        """Whether residuals about any spot are no longer what they were when the law was measured."""
+        change = (self.misfit / known.misfit).tolist()
+        return bool(max(change) >= LAW_CHANGE or min(change) <= 1.0 / LAW_CHANGE)
 
 
 def _stepped(

@@ -100,7 +100,7 @@ class Profiles(NamedTuple):
 
 
 def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
-    """Fit the profile to every blob; arguments as :func:`fit_centres`."""
+    """Fit the profile to every blob; arguments as :func:`.localisation.fit_centres`."""
     k = len(blobs)
     at = disc(blobs.radius)
     u, v = (axis.ravel()[at] for axis in grid(blobs.radius))
@@ -194,7 +194,8 @@ def _rows(
 
 def misfit_of(by_spot: FloatArray) -> FloatArray:
     """Mean weighted squares (k,) of residuals, the last of the rows (k, 11, p)."""
-    return np.asarray((by_spot[:, -1] ** 2).mean(axis=1))
+    weighted = by_spot[:, -1]
+    return np.asarray((weighted * weighted).sum(axis=1) / weighted.shape[1])
 
 
 def _is_sharp(

@@ -39,6 +39,11 @@ class SliceInfo:
     #: ``--with-uids`` only
     uids: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def name(self) -> str:
+        """What a message calls the slice: spots without a file have no source."""
+        return self.source or "spots"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Slice:

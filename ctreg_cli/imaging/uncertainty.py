@@ -161,7 +161,7 @@ def odd_variance(
     variance = 0.25 * np.fmax(odd, 0.0).sum(axis=1) / pairs  # fmax passes NaN over
     excess = variance / noise**2 - 1.0
     chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
-    return np.asarray(noise**2 * excess * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
+    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
 
 
 def even_variance(residuals: FloatArray, quiet: BoolArray, *, smooth: FloatArray, rough: FloatArray) -> FloatArray:
@@ -174,7 +174,12 @@ def even_variance(residuals: FloatArray, quiet: BoolArray, *, smooth: FloatArray
     variance = MAD_TO_SD**2 * np.nan_to_num(nan_quantile(squares, 0.5))
     excess = variance / smooth**2 - 1.0
     chance = SURE_OF_STRUCTURE * MEDIAN_LOSS * np.sqrt(2.0 / count)
-    return np.asarray((variance - rough**2) * np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
+    return (variance - rough**2) * _beyond_chance(excess, chance)
+
+
+def _beyond_chance(excess: FloatArray, chance: FloatArray) -> FloatArray:
+    """What share (k,) of an excess counts: nothing up to what ``chance`` makes, all of what is far beyond."""
+    return np.asarray(np.maximum(1.0 - (chance / np.maximum(excess, chance)) ** 2, 0.0))
 
 
 @cache

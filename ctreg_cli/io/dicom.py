@@ -71,6 +71,7 @@ def read_dicom(path: Path, source: str, head: bytes = b"", size: int | None = No
         source: its name in results; ``#1``, ``#2``, ... is added in a multi-frame file.
         head: its first :data:`~ctreg_cli.io.dicom_plain.HEAD_BYTES`, where they have been read already: of a plain
             file no more is needed.
+        size: of the file, bytes, where it is known already.
 
     Returns:
         A record a frame, in the file's order. A file that cannot be used is one record with a ``problem``.

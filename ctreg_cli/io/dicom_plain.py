@@ -84,16 +84,11 @@ def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> Pl
         return None  # the first element contradicts the meta
     elements: dict[int, RawDataElement] = {}
     for tag, vr, length, at in _elements(head, begin, implicit=implicit):
-        if tag in wanted:
-            value = head[at : at + length]
-            if len(value) < length:
-                return None
-            elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
-        elif tag in pixel_tags:
+        if tag in pixel_tags:
             return PlainHeader(meta, elements, syntax, tag, vr, length, at)
-        elif tag == _CHARACTER_SET:
+        if tag in wanted or tag == _CHARACTER_SET:
             value = head[at : at + length]
-            if len(value) < length or value.strip(b" \0") not in _CHARACTER_SETS:
+            if len(value) < length or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
                 return None
             elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
     return None

@@ -120,8 +120,7 @@ def _own_poses(
             continue
         own = scale or item.info.scale
         if own is None:
-            source = item.info.source or "spots"
-            raise MissingScaleError(f"{source}: no pixel scale in the input; give one in mm per pixel")
+            raise MissingScaleError(f"{item.info.name}: no pixel scale in the input; give one in mm per pixel")
         verdict = register(
             item.spots,
             model,

@@ -166,7 +166,7 @@ def _unusable(item: SpotSlice, scale: Scale | None) -> str:
 def _refuse(slices: Sequence[SpotSlice], reasons: dict[int, str]) -> None:
     """Say what is missing from every slice; nothing where none could be read, which the rows will say."""
     for place, reason in reasons.items():
-        source = slices[place].info.source or "spots"
+        source = slices[place].info.name
         if reason == "no_position":
             raise InputError(
                 f"{source}: no place in the patient (DICOM ImagePositionPatient and ImageOrientationPatient), "

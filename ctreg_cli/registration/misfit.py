@@ -28,7 +28,7 @@ _EXPLAINED_P = 1e-3
 #: relative step of the numeric derivative with respect to the frame's height
 _STEP = 1e-4
 #: how far off (relative sd) a scale or a height may be
-_RELATIVE_SD = 0.05
+RELATIVE_SD = 0.05
 
 
 def covariance_with_misfit(
@@ -56,7 +56,7 @@ def covariance_with_misfit(
     J_plus = np.linalg.pinv(J)
     r_beside, beside = r - J @ (J_plus @ r), K - J @ (J_plus @ K)
     # the prior as three more observations: what the pose can imitate is then off by a few percent, not by half
-    information = beside.T @ beside + np.eye(K.shape[1]) / _RELATIVE_SD**2
+    information = beside.T @ beside + np.eye(K.shape[1]) / RELATIVE_SD**2
     pull = beside.T @ r_beside
     theta = np.linalg.solve(information, pull)
     score = float(pull @ theta)
@@ -84,7 +84,7 @@ def _spread_by_scale(model: RodModel, T: FloatArray, covariance: FloatArray, see
     if not np.isfinite(start.chi2).all():
         return np.zeros((6, 6))
     fit = refine_scales(
-        model, T[None], seen, prior_mm_per_px=seen.mm_per_px, prior_sd=_RELATIVE_SD * seen.mm_per_px, iterations=15
+        model, T[None], seen, prior_mm_per_px=seen.mm_per_px, prior_sd=RELATIVE_SD * seen.mm_per_px, iterations=15
     )
     # seen from the pixels, not from the corner of the image: the frame's centre stays at its spots
     T_free = np.array(fit.T[0])

@@ -16,14 +16,16 @@ import numpy as np
 from scipy.special import gammaln
 
 from ctreg_cli.arrays import FloatArray, IntArray
-from ctreg_cli.geometry.projection import project, within_bounds
+from ctreg_cli.geometry.motion_field import scale_jacobian
+from ctreg_cli.geometry.projection import within_bounds
 from ctreg_cli.registration.evidence import P_SEEN
 from ctreg_cli.registration.matching import Matches, Scene, observations, search
+from ctreg_cli.registration.misfit import RELATIVE_SD
 from ctreg_cli.registration.refine import Observations, linearise, refine_scales
 from ctreg_cli.rods import RodModel
 
-#: how far off (relative sd) a scale may be, and the ln odds that it is so
-RELATIVE_SD, LOG_PRIOR = 0.05, math.log(0.01)
+#: the ln odds that a scale is off
+LOG_PRIOR = math.log(0.01)
 #: how far off a wrong frame or scale may put the spots, in frame sizes
 LOOSE_SHARE = 0.02
 #: so many of the loose matches are tried
@@ -80,10 +82,9 @@ def _log_evidence(model: RodModel, scene: Scene, T: FloatArray, seen: Observatio
     chi2 = float(fit.chi2[0])
     volume = 0.0
     if with_scales:
-        stretch = np.zeros((len(A), 2, 2))
-        stretch[:, 0, 0], stretch[:, 1, 1] = -fit.predicted_px[0, used].T
-        A = np.concatenate([A, stretch], axis=2)
-        off = np.log(seen.mm_per_px) / RELATIVE_SD
+        scale = seen.mm_per_px
+        A = np.concatenate([A, scale_jacobian(fit.predicted_px[0, used] * scale, scale) * scale], axis=2)
+        off = np.log(scale) / RELATIVE_SD
         chi2 += float(off @ off)
         volume -= 2 * math.log(RELATIVE_SD)
     H = np.einsum("nki,nkl,nlj->ij", A, fit.weight[0, used], A)
@@ -95,8 +96,7 @@ def _log_evidence(model: RodModel, scene: Scene, T: FloatArray, seen: Observatio
     n, m = int(used.sum()), len(scene.xy_mm)
     centre = scene.xy_mm.mean(axis=0)
     area = math.pi * float(np.square(scene.xy_mm - centre).sum(axis=1).max())
-    near_end = _NEAR_END * model.lengths
-    cut = within_bounds(project(T, model.starts, model.directions).lambda_mm - near_end, model.lengths - 2 * near_end)
+    cut = within_bounds(fit.lambda_mm[0], model.lengths, -_NEAR_END * model.lengths)
     return (
         volume
         - 0.5 * chi2

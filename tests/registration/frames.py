@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
@@ -11,7 +12,7 @@ from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Registration
 from ctreg_cli.rods import Mount, Rod, RodModel
 from ctreg_cli.scale import Scale
-from tests.oracle import OracleFrame, OracleScene, scene
+from tests.oracle import OracleFrame, OracleScene, cross_lines, scene
 
 
 def model_of(frame: OracleFrame, *, tolerance_mm: float = 0.0, mount: Mount | None = None) -> RodModel:
@@ -34,6 +35,16 @@ def some_scene(rng: np.random.Generator, frame: OracleFrame, **options: object) 
         result = scene(rng, frame, **options)  # type: ignore[arg-type]
         if result is not None:
             return result
+
+
+def on_its_mount(model: RodModel, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation of a frame that lies as its file says (or as drawn) but for a few degrees; its crossings (k, 2), mm."""
+    R = Rotation.from_rotvec(rng.normal(0.0, np.radians([6.0, 6.0, 10.0]))).as_matrix()
+    if model.mount is not None:
+        R = R @ np.array(model.mount.patient_from_model, dtype=np.float64)
+    t = np.array([128.0, 128.0, 0.0]) - R @ (model.centre + rng.uniform(-40.0, 40.0) * np.array([0.0, 0.0, 1.0]))
+    is_cut = (model.starts @ R.T + t)[:, 2] * (model.ends @ R.T + t)[:, 2] < 0
+    return R, cross_lines(model.starts, model.ends, R, t)[is_cut]
 
 
 def spots_of(world: OracleScene) -> Spots:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Registration
-from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from tests.oracle import OracleFrame, OracleScene, cross_lines, random_frame, twist_error
-from tests.registration.frames import frame_of, model_of, some_scene
+from tests.oracle import OracleFrame, OracleScene, random_frame, twist_error
+from tests.registration.frames import frame_of, model_of, on_its_mount, some_scene
 
 NOISE_PX = 0.1
 CUBE = frame_of(load_rod_model("rod-cube-30x30x40"))
@@ -58,18 +56,6 @@ def test_an_error_of_two_percent_is_refused_or_covered(taller: float, stretch: t
     assert beyond <= 1
 
 
-def on_its_mount(model: RodModel, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation and place of a frame that lies as its file says but for a few degrees, and all its crossings, mm."""
-    assert model.mount is not None
-    R = Rotation.from_rotvec(rng.normal(0.0, np.radians([6.0, 6.0, 10.0]))).as_matrix()
-    R = R @ np.array(model.mount.patient_from_model, dtype=np.float64)
-    t = np.array([128.0, 128.0, 0.0]) - R @ (model.centre + rng.uniform(-40.0, 40.0) * np.array([0.0, 0.0, 1.0]))
-    ends = model.starts + model.lengths[:, None] * model.directions
-    a, b = (points @ R.T + t for points in (model.starts, ends))
-    is_cut = a[:, 2] * b[:, 2] < 0
-    return R, t, cross_lines(model.starts, ends, R, t)[is_cut]
-
-
 @pytest.mark.parametrize("name", ["leksell-g-3-panel", "leksell-g-4-panel", "brw"])
 @pytest.mark.parametrize("stretch", [(1.02, 1.0), (1.0, 1.02), (0.98, 1.0), (1.0, 1.0)])
 def test_a_scale_of_one_axis_that_a_tilt_would_hide_shows_in_the_rods_left_over(
@@ -79,7 +65,7 @@ def test_a_scale_of_one_axis_that_a_tilt_would_hide_shows_in_the_rods_left_over(
     model, rng = load_rod_model(name), np.random.default_rng([882, len(name)])
     statuses = []
     for seed in range(6):
-        R, _, xy_mm = on_its_mount(model, rng)
+        R, xy_mm = on_its_mount(model, rng)
         uv = xy_mm / 0.5 + rng.normal(0.0, NOISE_PX, xy_mm.shape)
         scale = Scale(s_x=0.5 * stretch[0], s_y=0.5 * stretch[1])
         result = register(Spots.from_points(uv, NOISE_PX), model, scale=scale)
