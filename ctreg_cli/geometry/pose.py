@@ -17,6 +17,9 @@ from ctreg_cli.arrays import FloatArray
 _SMALL_SINE, _NEARLY_OPPOSITE = 1e-8, -0.9
 #: half an angle is never taken to be less: its sine is itself
 _TINY_RAD = 1e-30
+_EYE = np.eye(3)
+#: (3, 9) that makes ``[Ω]ₓ`` of Ω, row by row
+_CROSS = np.cross(np.eye(3)[:, None], _EYE).transpose(0, 2, 1).reshape(3, 9)
 
 
 def make_pose(R: FloatArray, t: FloatArray) -> FloatArray:
@@ -36,26 +39,17 @@ def inverse(T: FloatArray) -> FloatArray:
 def exp_rotation(omega_rad: FloatArray) -> FloatArray:
     """Rotations ``exp([Ω]ₓ)`` (..., 3, 3) of rotation vectors (..., 3); Rodrigues' formula, exact near zero too.
 
-    ``cos θ I + a [Ω]ₓ + b Ω Ωᵀ`` with ``a = sin θ / θ`` and ``b = (1 − cos θ) / θ²``.
+    ``I + a [Ω]ₓ + b [Ω]ₓ²`` with ``a = sin θ / θ`` and ``b = (1 − cos θ) / θ²``.
     """
     omega = np.asarray(omega_rad, dtype=np.float64)
-    angle2 = (omega * omega).sum(axis=-1)
-    half = np.maximum(0.5 * np.sqrt(angle2), _TINY_RAD)  # no division by nothing, and no branch
+    half = np.maximum(0.5 * np.sqrt((omega * omega).sum(axis=-1)), _TINY_RAD)  # no division by nothing, and no branch
     sinc = np.sin(half) / half
-    b = 0.5 * sinc * sinc
-    rotation: FloatArray = omega[..., :, None] * omega[..., None, :]
-    rotation *= b[..., None, None]
-    axis = omega * (sinc * np.cos(half))[..., None]
-    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
-    rotation[..., 0, 1] -= z
-    rotation[..., 1, 0] += z
-    rotation[..., 0, 2] += y
-    rotation[..., 2, 0] -= y
-    rotation[..., 1, 2] -= x
-    rotation[..., 2, 1] += x
-    cosine = 1.0 - b * angle2
-    for i in range(3):
-        rotation[..., i, i] += cosine
+    turn: FloatArray = (omega @ _CROSS).reshape(*omega.shape, 3)
+    rotation: FloatArray = turn @ turn
+    rotation *= (0.5 * sinc * sinc)[..., None, None]
+    turn *= (sinc * np.cos(half))[..., None, None]
+    rotation += turn
+    rotation += _EYE
     return rotation
 
 

@@ -31,6 +31,8 @@ _CHARACTER_SETS = frozenset({b"", b"ISO_IR 6", b"ISO_IR 100", b"ISO_IR 192"})
 
 _explicit, _implicit = struct.Struct("<HH2sH").unpack_from, struct.Struct("<HHL").unpack_from
 _long_length = struct.Struct("<L").unpack_from
+#: ``RawDataElement._make`` without counting the fields
+_element = tuple.__new__
 
 
 class PlainHeader(NamedTuple):
@@ -63,7 +65,6 @@ def read_plain(head: bytes, wanted: Container[int], pixel_tags: Container[int]) 
 
 
 def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> PlainHeader | None:
-    make = RawDataElement._make
     meta: dict[int, RawDataElement] = {}
     begin = _PREAMBLE + len(_MAGIC)
     for tag, vr, length, at in _elements(head, begin, implicit=False):
@@ -73,7 +74,7 @@ def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> Pl
         value = head[at:begin]
         if len(value) < length:
             return None
-        meta[tag] = make((tag, vr, length, value, at, False, True, True, False))
+        meta[tag] = _element(RawDataElement, (tag, vr, length, value, at, False, True, True, False))
     named = meta.get(_TRANSFER_SYNTAX)
     syntax = named and _SYNTAXES.get((named.value or b"").strip(b" \0"))
     group, _, code, _ = _explicit(head, begin)
@@ -90,7 +91,7 @@ def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> Pl
             value = head[at : at + length]
             if len(value) < length or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
                 return None
-            elements[tag] = make((tag, vr, length, value, at, implicit, True, True, False))
+            elements[tag] = _element(RawDataElement, (tag, vr, length, value, at, implicit, True, True, False))
     return None
 
 
