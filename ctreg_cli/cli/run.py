@@ -92,13 +92,15 @@ def choose_scale(
 
 
 def warned(source: Source, talk: Talk) -> Iterator[SliceLike]:
-    """The slices, with broken ones named as they pass."""
+    """The slices, with broken ones named as they pass, but for those that :func:`open_inputs` has named."""
     n_broken = 0
+    named = "\n".join(source.warnings)
     for item in source:
         if not isinstance(item, Slice) and item.problem:
             n_broken += 1
-            if n_broken <= MAX_NAMED:
-                talk.warn(f"{item.info.source}: {item.problem}")
+            broken = f"{item.info.source}: {item.problem}"
+            if n_broken <= MAX_NAMED and broken not in named:
+                talk.warn(broken)
         yield item
     if n_broken > MAX_NAMED:
         talk.warn(f"... and {n_broken - MAX_NAMED} more slices that could not be read")

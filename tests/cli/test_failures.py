@@ -45,12 +45,12 @@ def assert_refused(*arguments: object, say: str) -> None:
     assert "Traceback" not in result.stderr
 
 
-def test_a_broken_slice_is_a_row_and_a_warning(a_broken_one: Path, tmp_path: Path) -> None:
+def test_a_broken_slice_is_a_row_and_one_warning(a_broken_one: Path, tmp_path: Path) -> None:
     result = run_ctreg("pose", a_broken_one, "-m", FRAME, "-o", tmp_path / "p.csv")
     rows = read_results(tmp_path / "p.csv")
     assert [(row.status, row.reason) for row in rows].count(("no_pose", "unreadable")) == 1
     assert [row.status for row in rows].count("ok") == 2
-    assert "ctreg: warning: track_002.dcm" in result.stderr
+    assert result.stderr.count("track_002.dcm: Pixel Data (7FE0,0010)") == 1
     run_ctreg("pose", a_broken_one, "-m", FRAME, "-q", "--strict", code=1)
 
 
