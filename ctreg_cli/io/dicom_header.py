@@ -26,7 +26,7 @@ from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian
 from pydicom.valuerep import VR
 from pydicom.values import convert_SQ
 
-from ctreg_cli.io.dicom_plain import HEAD_BYTES, read_plain
+from ctreg_cli.io.dicom_plain import HEAD_BYTES, PlainReader
 
 #: what is read of a header, top level; all else is stepped over
 _TOP_LEVEL = (
@@ -53,6 +53,7 @@ _NESTED = (
 _TAG: dict[str, int] = {keyword: int(tag_for_keyword(keyword) or 0) for keyword in (*_TOP_LEVEL, *_NESTED)}
 _TOP_LEVEL_TAGS = dict.fromkeys(_TAG[keyword] for keyword in _TOP_LEVEL)
 _PIXEL_TAGS = {_TAG[keyword]: keyword for keyword in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")}
+_read_plain = PlainReader(_TOP_LEVEL_TAGS, _PIXEL_TAGS)
 
 PREAMBLE_BYTES = 128
 MAGIC = b"DICM"
@@ -368,7 +369,7 @@ def read_header(file: BinaryIO, size: int, *, tried_plain: bool = False) -> Head
 
 def plain_header(head: bytes, size: int) -> Header | None:
     """The header of a file of ``size`` bytes from its first :data:`HEAD_BYTES`; None where it is not plain."""
-    plain = read_plain(head, _TOP_LEVEL_TAGS, _PIXEL_TAGS)
+    plain = _read_plain(head)
     if plain is None:
         return None
     return Header(

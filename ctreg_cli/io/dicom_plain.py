@@ -2,14 +2,16 @@
 
 Plain is: with preamble and file meta, implicit or explicit VR little endian as the meta says, every element down to
 the pixels of a known VR and a definite length, and all of it within the first bytes of the file. Of anything else
-:func:`read_plain` says nothing, and pydicom walks through it (:mod:`.dicom_header`); what both read is the same,
-element by element, which the tests hold.
+:class:`PlainReader` says nothing, and pydicom walks through it (:mod:`.dicom_header`); what both read is the same,
+element by element, which the tests hold. From slice to slice most elements stand where they stood: then only the values
+are read.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
+from operator import itemgetter
 from typing import NamedTuple
 
 from pydicom.dataelem import RawDataElement
@@ -32,7 +34,10 @@ _CHARACTER_SETS = frozenset({b"", b"ISO_IR 6", b"ISO_IR 100", b"ISO_IR 192"})
 _explicit, _implicit = struct.Struct("<HH2sH").unpack_from, struct.Struct("<HHL").unpack_from
 _long_length = struct.Struct("<L").unpack_from
 #: ``RawDataElement._make`` without counting the fields
-_element = tuple.__new__
+_raw = tuple.__new__
+_NOTHING = slice(0, 0)
+#: so many layouts are remembered: from slice to slice lengths of numbers change
+_MOST_LAYOUTS = 8
 
 
 class PlainHeader(NamedTuple):
@@ -48,55 +53,125 @@ class PlainHeader(NamedTuple):
     pixel_offset: int
 
 
-def read_plain(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> PlainHeader | None:
-    """The header at the ``head`` of a file, or None where it is not plain.
+class PlainReader:
+    """Reads the headers of plain files; one for all files, since those of a series are laid out alike."""
 
-    Args:
-        head: the first bytes of the file, :data:`HEAD_BYTES` or all there are.
-        wanted: tags of the elements to keep beside the file meta.
-        pixel_tags: tags at which to stop.
+    def __init__(self, wanted: Container[int], pixel_tags: Container[int]) -> None:
+        """Keep elements of the tags ``wanted`` beside the file meta, and stop at one of ``pixel_tags``."""
+        self._wanted, self._pixel_tags = wanted, pixel_tags
+        self._recent: tuple[_Layout, ...] = ()
+
+    def __call__(self, head: bytes) -> PlainHeader | None:
+        """The header at the ``head`` of a file, :data:`HEAD_BYTES` or all there are; None where it is not plain."""
+        if head[_PREAMBLE : _PREAMBLE + 4] != _MAGIC:
+            return None
+        for layout in self._recent:
+            if layout.marks(head) == layout.marked:
+                return layout.header(head)
+        try:
+            found = _layout(head, self._wanted, self._pixel_tags)
+        except struct.error:  # it goes on beyond the head, or the file ends
+            return None
+        if found is None:
+            return None
+        self._recent = (found, *self._recent[: _MOST_LAYOUTS - 1])
+        return found.header(head)
+
+
+class _Element(NamedTuple):
+    """Where an element's value is."""
+
+    tag: int
+    vr: str | None
+    length: int
+    at: int
+
+
+class _Layout(NamedTuple):
+    """Where the elements of a head are. They are in the same places wherever the ``marks`` are the same bytes.
+
+    Marks are all tags, VRs and lengths, and the values that say how to go on.
     """
-    if head[_PREAMBLE : _PREAMBLE + 4] != _MAGIC:
-        return None
-    try:
-        return _read(head, wanted, pixel_tags)
-    except struct.error:  # it goes on beyond the head, or the file ends
-        return None
+
+    marks: Callable[[bytes], tuple[bytes, ...]]
+    marked: tuple[bytes, ...]
+    #: of the values to keep: all of the file meta, those wanted of the data set, and nothing at last
+    values: Callable[[bytes], tuple[bytes, ...]]
+    meta: list[_Element]
+    elements: list[_Element]
+    transfer_syntax: UID
+    pixels: _Element
+
+    def header(self, head: bytes) -> PlainHeader:
+        """The header of a head that is laid out like this."""
+        values = self.values(head)
+        implicit, n = self.transfer_syntax == ImplicitVRLittleEndian, len(self.meta)
+        meta, elements = (
+            {
+                tag: _raw(RawDataElement, (tag, vr, length, value, at, is_implicit, True, True, False))
+                for (tag, vr, length, at), value in zip(places, part, strict=True)
+            }
+            for places, part, is_implicit in ((self.meta, values[:n], False), (self.elements, values[n:-1], implicit))
+        )
+        return PlainHeader(meta, elements, self.transfer_syntax, *self.pixels)
 
 
-def _read(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> PlainHeader | None:
-    meta: dict[int, RawDataElement] = {}
-    begin = _PREAMBLE + len(_MAGIC)
-    for tag, vr, length, at in _elements(head, begin, implicit=False):
+def _layout(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> _Layout | None:
+    """Where the elements of a head are; None where it is not plain.
+
+    Raises:
+        struct.error: the head ends before the pixels.
+    """
+    meta: list[_Element] = []
+    marks: list[slice] = []
+    end = _PREAMBLE + len(_MAGIC)
+    syntax = None
+    for element in _elements(head, end, implicit=False):
+        tag, _, length, at = element
         if tag >> 16 != _META_GROUP:
             break
-        begin = at + length
-        value = head[at:begin]
-        if len(value) < length:
+        marks.append(slice(end, at))
+        end = at + length
+        if end > len(head):
             return None
-        meta[tag] = _element(RawDataElement, (tag, vr, length, value, at, False, True, True, False))
-    named = meta.get(_TRANSFER_SYNTAX)
-    syntax = named and _SYNTAXES.get((named.value or b"").strip(b" \0"))
-    group, _, code, _ = _explicit(head, begin)
-    if not syntax or group == _META_GROUP:
+        meta.append(element)
+        if tag == _TRANSFER_SYNTAX:
+            marks.append(slice(at, end))
+            syntax = _SYNTAXES.get(head[at:end].strip(b" \0"))
+    group, _, code, _ = _explicit(head, end)
+    if syntax is None or group == _META_GROUP:
         return None
     implicit = syntax == ImplicitVRLittleEndian
     if implicit == (code in _SHORT or code in _LONG) or (implicit and code.isalpha() and code.isupper()):
         return None  # the first element contradicts the meta
-    elements: dict[int, RawDataElement] = {}
-    for tag, vr, length, at in _elements(head, begin, implicit=implicit):
+    kept: list[_Element] = []
+    for element in _elements(head, end, implicit=implicit):
+        tag, _, length, at = element
+        marks.append(slice(end, at))
+        end = at + length
         if tag in pixel_tags:
-            return PlainHeader(meta, elements, syntax, tag, vr, length, at)
+            marks_of = itemgetter(*marks)
+            return _Layout(
+                marks=marks_of,
+                marked=marks_of(head),
+                values=itemgetter(*(slice(e.at, e.at + e.length) for e in (*meta, *kept)), _NOTHING),
+                meta=meta,
+                elements=kept,
+                transfer_syntax=syntax,
+                pixels=element,
+            )
         if tag in wanted or tag == _CHARACTER_SET:
-            value = head[at : at + length]
-            if len(value) < length or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
+            value = head[at:end]
+            if end > len(head) or (tag == _CHARACTER_SET and value.strip(b" \0") not in _CHARACTER_SETS):
                 return None
-            elements[tag] = _element(RawDataElement, (tag, vr, length, value, at, implicit, True, True, False))
+            kept.append(element)
+        if tag == _CHARACTER_SET:
+            marks.append(slice(at, end))
     return None
 
 
-def _elements(head: bytes, at: int, *, implicit: bool) -> Iterator[tuple[int, str | None, int, int]]:
-    """Tag, VR, length, and place of the value, of element after element; ends at one that is not plain.
+def _elements(head: bytes, at: int, *, implicit: bool) -> Iterator[_Element]:
+    """Element after element; ends at one that is not plain.
 
     Raises:
         struct.error: the head ends.
@@ -119,5 +194,5 @@ def _elements(head: bytes, at: int, *, implicit: bool) -> Iterator[tuple[int, st
                 at += 4
                 if length == _UNDEFINED:
                     return
-        yield group << 16 | element, vr, length, at
+        yield _Element(group << 16 | element, vr, length, at)
         at += length

@@ -15,7 +15,7 @@ from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRL
 
 from ctreg_cli.io import dicom_header
 from ctreg_cli.io.dicom_header import Header, HeaderProblem, read_header
-from ctreg_cli.io.dicom_plain import HEAD_BYTES, read_plain
+from ctreg_cli.io.dicom_plain import HEAD_BYTES
 from tests.io.dicom_samples import ct_slice, dicom_bytes, enhanced_ct, item, pixels, swap_to_big_endian
 from tests.io.test_fuzz import mutate
 
@@ -25,8 +25,7 @@ NOT_PLAIN = {"long header", "big endian", "bare", "undefined length", "charset I
 
 
 def is_plain(raw: bytes) -> bool:
-    tags = dicom_header._TOP_LEVEL_TAGS, dicom_header._PIXEL_TAGS
-    return read_plain(raw[:HEAD_BYTES], *tags) is not None
+    return dicom_header._read_plain(raw[:HEAD_BYTES]) is not None
 
 
 def told(header: Header) -> tuple[Any, ...]:
@@ -55,7 +54,7 @@ def by_pydicom(raw: bytes, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, ...] |
     """What the general reader says; None where it refuses."""
     with monkeypatch.context() as patched, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # as :mod:`ctreg_cli.io.dicom` does
-        patched.setattr(dicom_header, "read_plain", lambda *_: None)
+        patched.setattr(dicom_header, "_read_plain", lambda _: None)
         try:
             return told(read_header(io.BytesIO(raw), len(raw)))
         except (HeaderProblem, RecursionError):
