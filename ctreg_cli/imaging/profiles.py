@@ -123,73 +123,102 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
     if not usable.all():
         root_weights = np.where(usable, root_weights, math.sqrt(LEFT_OUT) * root_weights)
 
+    pixels = _Pixels(u, v, values, clipped, root_weights)
     brightest = _brightest(blobs, values, usable & (distance < NEAR_PX[0]), u, v)
     long = LongSpots.of(blobs)
-    rows = _rows(u, v, values, clipped, root_weights, long)
-    parameters, normal = fit(rows, _start(blobs, n_clipped, brightest, long))
-    sharp = _is_sharp(blobs, parameters, rows, long, n_clipped > 0, ceiling)
-    few = np.flatnonzero(sharp)
+    rows = pixels.rows(long)
+    fitted = _Fitted(*fit(rows, _start(blobs, n_clipped, brightest, long)), rows.by_spot, long)
+    few = np.flatnonzero(_is_sharp(blobs, fitted, n_clipped > 0, ceiling))
+    sharp = flat = few[:0]
     if len(few):
-        clipped_few = None if clipped is None else clipped[few]
-        part = values[few], clipped_few, root_weights[few]
-        first = np.where(long.mask, _start(blobs, n_clipped, brightest, LongSpots.none(k)), parameters)
-        of_few = _fit_sharp(blobs.take(few), u, v, *part, n_clipped[few], brightest[:, few], first[:, few])
+        some = blobs.take(few)
+        round_start = _start(some, n_clipped[few], brightest[:, few], LongSpots.none(len(few)))
+        first = np.where(long.mask[few], round_start, fitted.parameters[:, few])
+        others = _fit_sharp(some, pixels.take(few), n_clipped[few], brightest[:, few], first)
         # of what is cut off (one pixel of every image is the brightest), and neither way explains (a sharp kernel's
         # undershoot), the common fit is the steadier one
-        least = np.where(n_clipped[few] > 1, CLEARLY_BETTER, np.inf) * misfit_of(rows.by_spot[few])
-        better = misfit_of(of_few[2]) < least
-        few = few[better]
-        parameters[:, few], normal[few], rows.by_spot[few] = of_few[0][:, better], of_few[1][better], of_few[2][better]
-        long = long.replaced(few, of_few[3].take(better))
-        sharp[:] = False
-        sharp[few] = True
-    flat = np.zeros(k, dtype=bool)
-    is_poor = misfit_of(rows.by_spot) > POOR
-    may_be_flat = (n_clipped > 0) & ((parameters[FLATNESS] > FLAT_CUT) | is_poor)
-    may_be_flat |= parameters[FLATNESS] > FLAT
-    few = np.flatnonzero(may_be_flat & ~long.mask & (blobs.area > np.pi * RIM_PX**2))
+        least = np.where(n_clipped[few] > 1, CLEARLY_BETTER, np.inf)
+        fitted, sharp = fitted.with_better(few, others, least)
+    is_poor = misfit_of(fitted.by_spot) > POOR
+    may_be_flat = (n_clipped > 0) & ((fitted.parameters[FLATNESS] > FLAT_CUT) | is_poor)
+    may_be_flat |= fitted.parameters[FLATNESS] > FLAT
+    few = np.flatnonzero(may_be_flat & ~fitted.long.mask & (blobs.area > np.pi * RIM_PX**2))
     if len(few):
-        clipped_few = None if clipped is None else clipped[few]
-        part = values[few], clipped_few, root_weights[few]
-        first = _flat_start(parameters[:, few], blobs.take(few), n_clipped[few] > 0)
-        edges, edges_normal, by_spot = _fit_flat(u, v, *part, first, blobs.radius)
-        better = misfit_of(by_spot) < misfit_of(rows.by_spot[few])
-        few = few[better]
-        parameters[:, few], normal[few], rows.by_spot[few] = edges[:, better], edges_normal[better], by_spot[better]
-        flat[few] = True
+        first = _flat_start(fitted.parameters[:, few], blobs.take(few), n_clipped[few] > 0)
+        others = _fit_flat(pixels.take(few), first, blobs.radius)
+        fitted, flat = fitted.with_better(few, others, np.ones(len(few)))
     return Profiles(
-        parameters=parameters,
-        long=long,
-        centre=long.turned_back(parameters[CENTRE]),
-        normal=normal,
+        parameters=fitted.parameters,
+        long=fitted.long,
+        centre=fitted.long.turned_back(fitted.parameters[CENTRE]),
+        normal=fitted.normal,
         rows=rows,
-        residuals=rows.by_spot[:, -1] / root_weights,
+        residuals=fitted.by_spot[:, -1] / root_weights,
         noise=noise,
         structure_slope=structure_slope,
         near=near,
         quiet=usable & (distance > NOISE_BEYOND_PX),
         height=blobs.height,
         n_clipped=n_clipped,
-        sharp=sharp,
-        flat=flat,
+        sharp=np.isin(np.arange(k), sharp),
+        flat=np.isin(np.arange(k), flat),
         ceiling=ceiling,
     )
 
 
-def _rows(
-    u: FloatArray,
-    v: FloatArray,
-    values: FloatArray,
-    clipped: BoolArray | None,
-    root_weights: FloatArray,
-    long: LongSpots,
-    areas: Areas | None = None,
-) -> Rows:
-    """:class:`.profile.Rows` of windows of which some show ``long`` spots, seen along their own axes."""
-    if not len(long):
-        return Rows(u, v, values, clipped, root_weights, areas=areas)
-    along, across = long.coordinates(u, v)
-    return Rows(along, across, values, clipped, root_weights, long.mask, areas)
+class _Pixels(NamedTuple):
+    """The pixels of ``k`` windows, and how they are weighted."""
+
+    #: (p,) coordinates
+    u: FloatArray
+    v: FloatArray
+    #: (k, p)
+    values: FloatArray
+    #: (k, p) which of these are cut off; None where none is
+    clipped: BoolArray | None
+    #: (k, p)
+    root_weights: FloatArray
+
+    def take(self, which: IntArray) -> _Pixels:
+        """Some of the windows."""
+        clipped = None if self.clipped is None else self.clipped[which]
+        return _Pixels(self.u, self.v, self.values[which], clipped, self.root_weights[which])
+
+    def rows(self, long: LongSpots) -> Rows:
+        """For profiles of which some are ``long``, seen along their own axes."""
+        if not len(long):
+            return Rows(self.u, self.v, self.values, self.clipped, self.root_weights)
+        along, across = long.coordinates(self.u, self.v)
+        return Rows(along, across, self.values, self.clipped, self.root_weights, long.mask)
+
+    def area_rows(self, long: LongSpots, reach: float, *, flat: bool = False) -> Rows:
+        """The same, the pixels up to ``reach`` from the middles taken as means over their areas."""
+        areas, u, v = Areas.within(self.u, self.v, reach)
+        if not len(long):
+            return Rows(u, v, self.values, self.clipped, self.root_weights, areas=areas, flat=flat)
+        along, across = long.coordinates(u, v)
+        return Rows(along, across, self.values, self.clipped, self.root_weights, long.mask, areas, flat=flat)
+
+
+class _Fitted(NamedTuple):
+    """Profiles of ``k`` spots, as far as they have been fitted."""
+
+    #: (10, k), (k, 10, 10), and derivatives and residuals (k, 11, p)
+    parameters: FloatArray
+    normal: FloatArray
+    by_spot: FloatArray
+    long: LongSpots
+
+    def with_better(self, few: IntArray, others: _Fitted, least: FloatArray) -> tuple[_Fitted, IntArray]:
+        """With those ``others`` of the spots ``few`` (f,) that misfit less than ``least`` (f,) times these; and which.
+
+        All arrays are written to in place.
+        """
+        better = misfit_of(others.by_spot) < least * misfit_of(self.by_spot[few])
+        few = few[better]
+        self.parameters[:, few], self.normal[few] = others.parameters[:, better], others.normal[better]
+        self.by_spot[few] = others.by_spot[better]
+        return self._replace(long=self.long.replaced(few, others.long.take(better))), few
 
 
 def misfit_of(by_spot: FloatArray) -> FloatArray:
@@ -198,17 +227,16 @@ def misfit_of(by_spot: FloatArray) -> FloatArray:
     return np.asarray((weighted * weighted).sum(axis=1) / weighted.shape[1])
 
 
-def _is_sharp(
-    blobs: Blobs, parameters: FloatArray, rows: Rows, long: LongSpots, clipped: BoolArray, ceiling: float
-) -> BoolArray:
+def _is_sharp(blobs: Blobs, fitted: _Fitted, clipped: BoolArray, ceiling: float) -> BoolArray:
     """Whether (k,) pixels are too wide to be seen as points of a fitted profile.
 
     Or whether a spot of few pixels was taken for a long one, and does not look like that.
     """
-    at_edge, at_ceiling = steepness(parameters, long.mask, ceiling)
+    long = fitted.long
+    at_edge, at_ceiling = steepness(fitted.parameters, long.mask, ceiling)
     sharp = (at_edge > SHARP) | (clipped & (at_ceiling > SHARP_CUT))
     coarse = long.index[blobs.area[long.index] < COARSE_PX2]
-    sharp[coarse] |= (at_edge[coarse] > SHARP_COARSE) & (misfit_of(rows.by_spot[coarse]) > COARSE_MISFIT)
+    sharp[coarse] |= (at_edge[coarse] > SHARP_COARSE) & (misfit_of(fitted.by_spot[coarse]) > COARSE_MISFIT)
     return np.asarray(sharp)
 
 
@@ -233,57 +261,31 @@ def _flat_start(parameters: FloatArray, blobs: Blobs, clipped: BoolArray) -> Flo
     return start
 
 
-def _fit_flat(
-    u: FloatArray,
-    v: FloatArray,
-    values: FloatArray,
-    clipped: BoolArray | None,
-    root_weights: FloatArray,
-    first: FloatArray,
-    radius: int,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit edges about flat tops, from the ``first`` parameters (10, k); else as :func:`_fit_sharp`."""
-    rows = Rows(u, v, values, clipped, root_weights, flat=True)
+def _fit_flat(pixels: _Pixels, first: FloatArray, radius: int) -> _Fitted:
+    """Fit edges about flat tops, from the ``first`` parameters (10, k), in windows of this radius."""
+    none = LongSpots.none(first.shape[1])
     steep = np.log(2.0) * np.exp(first[FLATNESS] + np.maximum(first[SHAPE][0], first[SHAPE][2])) > SHARP
-    if clipped is not None or steep.any():
-        areas, points_u, points_v = Areas.within(u, v, _reach(first, radius))
-        rows = Rows(points_u, points_v, values, clipped, root_weights, areas=areas, flat=True)
-    parameters, normal = fit(rows, first)
-    return parameters, normal, rows.by_spot
+    if pixels.clipped is not None or steep.any():
+        rows = pixels.area_rows(none, _reach(first, radius), flat=True)
+    else:
+        rows = Rows(*pixels, flat=True)
+    return _Fitted(*fit(rows, first), rows.by_spot, none)
 
 
-def _fit_sharp(
-    blobs: Blobs,
-    u: FloatArray,
-    v: FloatArray,
-    values: FloatArray,
-    clipped: BoolArray | None,
-    root_weights: FloatArray,
-    n_clipped: IntArray,
-    brightest: FloatArray,
-    first: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, LongSpots]:
+def _fit_sharp(blobs: Blobs, pixels: _Pixels, n_clipped: IntArray, brightest: FloatArray, first: FloatArray) -> _Fitted:
     """Fit profiles to pixels that are means over their areas.
 
     Which spots are long tells their fitted shape: few pixels above half height do not.
 
     Args:
         blobs: the windows.
-        u: (p,) coordinates of their pixels.
-        v: likewise.
-        values: (k, p).
-        clipped: (k, p) which of these are cut off, if any is.
-        root_weights: (k, p).
+        pixels: of these.
         n_clipped: (k,) how many of the blobs' own are cut off.
         brightest: (2, k) centres to start from.
         first: (10, k) parameters of spots that are not long, to start from.
-
-    Returns:
-        Parameters (10, k), normal matrices (k, 10, 10), derivatives and residuals (k, 11, p), and what is long.
     """
-    areas, points_u, points_v = Areas.within(u, v, _reach(first, blobs.radius))
-    long = LongSpots.none(len(blobs))
-    rows = _rows(points_u, points_v, values, clipped, root_weights, long, areas)
+    reach = _reach(first, blobs.radius)
+    rows = pixels.area_rows(LongSpots.none(len(blobs)), reach)
     start = first.copy()
     start[FLATNESS] = SHARP_START_LOG_BETA
     parameters, normal = fit(rows, start)
@@ -291,12 +293,11 @@ def _fit_sharp(
     if len(shown):
         few = shown.index
         long = shown.take(few)
-        clipped = None if clipped is None else clipped[few]
-        again = _rows(points_u, points_v, values[few], clipped, root_weights[few], long, areas)
+        again = pixels.take(few).area_rows(long, reach)
         start = _start(blobs.take(few), n_clipped[few], brightest[:, few], long)
         parameters[:, few], normal[few] = fit(again, start)
         rows.by_spot[few] = again.by_spot
-    return parameters, normal, rows.by_spot, shown
+    return _Fitted(parameters, normal, rows.by_spot, shown)
 
 
 def _clipped(values: FloatArray, own: BoolArray, ceiling: float) -> tuple[BoolArray | None, IntArray]:
