@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from functools import lru_cache
-
-import numpy as np
-
-from ctreg_cli.arrays import FloatArray, frozen
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry.patient import patient_from_slice, slice_axes
 from ctreg_cli.io.dicom_header import Elements, once_a_series, problem
 from ctreg_cli.scale import Scale
 
 #: no scanner's pixel is smaller or larger (mm): beyond, a digit or a decimal point was lost
 PIXEL_SPACING_RANGE_MM = (1e-3, 100.0)
-#: direction cosines written with three decimals are off by this much; beyond, they are not directions
-MAX_ORIENTATION_ERROR = 2e-3
 
 
 @once_a_series("PixelSpacing")
@@ -58,28 +52,9 @@ def read_patient_from_slice(position: Elements, orientation: Elements) -> FloatA
     cosines = orientation.decimals("ImageOrientationPatient", 6)
     if cosines is None:
         return None
-    axes = _axes(cosines)
+    axes = slice_axes(cosines)
     if axes is None:
         raise problem("ImageOrientationPatient", "is not two orthogonal unit vectors")
     if origin is None:
         return None
-    T = np.zeros((4, 4))
-    T[:3, :3], T[:3, 3], T[3, 3] = axes, origin, 1.0
-    T.flags.writeable = False
-    return T
-
-
-@lru_cache(maxsize=64)
-def _axes(cosines: tuple[float, ...]) -> FloatArray | None:
-    """Columns x, y, z, freed from the rounding of the written cosines; None if those are no directions.
-
-    A series repeats its orientation in every slice, hence the cache.
-    """
-    x, y = np.array(cosines[:3]), np.array(cosines[3:])
-    errors = (math.hypot(*x) - 1, math.hypot(*y) - 1, float(x @ y))
-    if not all(abs(error) <= MAX_ORIENTATION_ERROR for error in errors):
-        return None
-    # the orthonormal pair nearest to (x, y)
-    U, _, Vt = np.linalg.svd(np.column_stack([x, y]), full_matrices=False)
-    x, y = (U @ Vt).T
-    return frozen(np.column_stack([x, y, np.cross(x, y)]), (3, 3))
+    return patient_from_slice(axes, origin)

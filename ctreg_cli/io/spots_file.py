@@ -1,7 +1,7 @@
 """Spots files: what ``segment`` writes, what other programs may write, and what every other command reads.
 
 The table (CSV) is for people and spreadsheets; it gives centres back exactly and covariances to rounding error. The
-document (JSON, JSON Lines) also carries the slice's patient geometry and gives every number back exactly.
+document (JSON, JSON Lines) gives every number back exactly.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from ctreg_cli._version import __version__
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.errors import SpotsFileError
+from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX, Spots
-from ctreg_cli.io.sinks import Encoding
+from ctreg_cli.io.sinks import Encoding, cell
 
 SCHEMA = "ctreg/spots/1"
 
@@ -32,6 +33,8 @@ COLUMNS = (
     *("slice", "source", "time_s", "s_x_mm", "s_y_mm", "spot"),
     *MEASURED,
     *("sd_assumed", "thickness_mm", "rows", "columns", "problem"),
+    # where the slice lies in the patient: without it a frame's mount is taken in slice axes
+    *("series", "image_position_mm", "image_orientation"),
 )
 
 
@@ -74,6 +77,12 @@ def spots_encoding(*, options: Mapping[str, object] | None = None, with_uids: bo
     # the series key may be a UID: what leaves is only which slices share one
     series_numbers: dict[str, int] = {}
 
+    def series_number(info: SliceInfo) -> int:
+        return series_numbers.setdefault(info.series, len(series_numbers))
+
+    def rows(spot_slice: SpotSlice) -> list[Sequence[object]]:
+        return _rows(spot_slice, series_number(spot_slice.info) if len(spot_slice.spots) else 0)
+
     def record(spot_slice: SpotSlice) -> dict[str, object]:
         info, spots = spot_slice.info, spot_slice.spots
         uids: dict[str, object] = {"uids": dict(info.uids)} if with_uids else {}
@@ -87,7 +96,7 @@ def spots_encoding(*, options: Mapping[str, object] | None = None, with_uids: bo
             "rows": info.shape[0] if info.shape else None,
             "columns": info.shape[1] if info.shape else None,
             "T_patient_slice": info.T_patient_slice,
-            "series": series_numbers.setdefault(info.series, len(series_numbers)),
+            "series": series_number(info),
             "problem": spot_slice.problem,
             "sd_assumed": spots.sd_assumed,
             "spots": _spot_records(spots),
@@ -97,7 +106,7 @@ def spots_encoding(*, options: Mapping[str, object] | None = None, with_uids: bo
     def head(_first: SpotSlice | None) -> dict[str, object]:
         return {"schema": SCHEMA, "ctreg": __version__, "options": options or {}}
 
-    return Encoding(columns=COLUMNS, rows=_rows, record=record, header=head, records_key="slices")
+    return Encoding(columns=COLUMNS, rows=rows, record=record, header=head, records_key="slices")
 
 
 def _spot_records(spots: Spots) -> list[dict[str, object]]:
@@ -118,14 +127,21 @@ def _measured(spots: Spots) -> FloatArray:
     )
 
 
-def _rows(spot_slice: SpotSlice) -> list[Sequence[object]]:
+def _rows(spot_slice: SpotSlice, series: int) -> list[Sequence[object]]:
     info, spots = spot_slice.info, spot_slice.spots
     scale = (info.scale.s_x, info.scale.s_y) if info.scale else (None, None)
     head = (spot_slice.index, info.source, info.time_s, *scale)
     if not len(spots):
         # the spot and all after it empty; only a slice that could not be read says why
-        after = [None] * (len(COLUMNS) - len(head) - 1)
-        return [(*head, *after, spot_slice.problem)]
+        after = {"problem": spot_slice.problem}
+        return [(*head, *map(after.get, COLUMNS[len(head) :]))]
     rows, columns = info.shape or (None, None)
-    tail = (int(spots.sd_assumed), info.thickness_mm, rows, columns, None)
+    T = info.T_patient_slice
+    place = (None, None) if T is None else (_values(T[:3, 3]), _values(T[:3, :2].T.ravel()))
+    tail = (int(spots.sd_assumed), info.thickness_mm, rows, columns, None, series, *place)
     return [(*head, i, *values, *tail) for i, values in enumerate(_measured(spots).tolist())]
+
+
+def _values(numbers: FloatArray) -> str:
+    """Numbers in one cell, separated as DICOM separates values."""
+    return "\\".join(map(cell, numbers.tolist()))

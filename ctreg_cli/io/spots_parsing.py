@@ -21,7 +21,10 @@ from ctreg_cli.io.spots_schema import SliceRecord, SpotsDocument
 NEEDED = ("slice", "u_px", "v_px")
 #: what is the same in every line of a slice
 SLICE_COLUMNS = frozenset(
-    ("slice", "source", "time_s", "s_x_mm", "s_y_mm", "thickness_mm", "rows", "columns", "problem")
+    (
+        *("slice", "source", "time_s", "s_x_mm", "s_y_mm", "thickness_mm", "rows", "columns", "problem"),
+        *("series", "image_position_mm", "image_orientation"),
+    )
 )
 #: mistakes quoted from one file; the rest are counted
 MAX_MISTAKES = 20
@@ -93,7 +96,21 @@ def _parse_table(text: str, name: str) -> list[SliceRecord]:
         records = []
     if mistakes:
         raise _error(sorted(mistakes, key=_line_of_message))
-    return records
+    return _placed(sorted(records, key=lambda record: record.slice))
+
+
+def _placed(records: Sequence[SliceRecord]) -> list[SliceRecord]:
+    """Slices without spots, of which a table says nothing more, belong where the slice before lies, or the next."""
+    told = [record for record in records if record.spots]
+    placed, last = [], told[0] if told else None
+    for record in records:
+        if record.spots:
+            last = record
+        elif last is not None and record.image_orientation is None and not record.series:
+            there = {name: getattr(last, name) for name in ("series", "image_position_mm", "image_orientation")}
+            record = record.model_copy(update=there)
+        placed.append(record)
+    return placed
 
 
 def _columns(header: Sequence[str], name: str) -> list[str]:

@@ -9,6 +9,8 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry.patient import patient_from_slice, slice_axes
 from ctreg_cli.geometry.pose import is_pose
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
@@ -27,6 +29,15 @@ Sd = Annotated[float, Field(ge=MIN_SD_PX, le=MAX_COORDINATE_PX)]
 Positive = Annotated[float, Field(gt=0)]
 Matrix2 = tuple[tuple[float, float], tuple[float, float]]
 Row4 = tuple[float, float, float, float]
+
+
+def _split(value: object) -> object:
+    """The numbers of a cell, separated as DICOM separates values; what is wrong with them is said of the whole."""
+    return value.split("\\") if isinstance(value, str) else value
+
+
+Position = Annotated[tuple[float, float, float], BeforeValidator(_split)]
+Cosines = Annotated[tuple[float, float, float, float, float, float], BeforeValidator(_split)]
 
 
 def _mistake(text: str) -> PydanticCustomError:
@@ -99,6 +110,9 @@ class SliceRecord(_Record):
     rows: Annotated[int, Field(gt=0)] | None = None
     columns: Annotated[int, Field(gt=0)] | None = None
     T_patient_slice: tuple[Row4, Row4, Row4, Row4] | None = None
+    #: the same as the table has it: Image Position and Image Orientation (Patient)
+    image_position_mm: Position | None = None
+    image_orientation: Cosines | None = None
     series: Annotated[str, BeforeValidator(str)] = ""
     problem: str = ""
     sd_assumed: bool = False
@@ -114,6 +128,10 @@ class SliceRecord(_Record):
             raise _mistake("rows, columns: give both or neither")
         if self.T_patient_slice is not None and not is_pose(np.array(self.T_patient_slice)):
             raise _mistake("T_patient_slice: must be a rigid transform (4 × 4, right-handed, last row 0 0 0 1)")
+        if (self.image_position_mm is None) != (self.image_orientation is None):
+            raise _mistake("image_position_mm, image_orientation: give both or neither")
+        if self.image_orientation is not None and slice_axes(self.image_orientation) is None:
+            raise _mistake("image_orientation: must be two orthogonal unit vectors, six numbers separated by \\")
         if self.problem and self.spots:
             raise _mistake("problem: a slice that could not be read has no spots")
         numbers = [spot.spot for spot in self.spots if spot.spot is not None]
@@ -126,6 +144,15 @@ class SliceRecord(_Record):
         """Whether some spot's place differs from the number it has in the file."""
         numbers = [spot.spot for spot in self._ordered()]
         return any(number is not None and number != place for place, number in enumerate(numbers))
+
+    @property
+    def _patient_from_slice(self) -> FloatArray | None:
+        if self.T_patient_slice is not None:
+            return np.array(self.T_patient_slice)
+        axes = None if self.image_orientation is None else slice_axes(self.image_orientation)
+        if axes is None or self.image_position_mm is None:
+            return None
+        return patient_from_slice(axes, self.image_position_mm)
 
     def _ordered(self) -> tuple[SpotRecord, ...]:
         if any(spot.spot is None for spot in self.spots):
@@ -148,7 +175,7 @@ class SliceRecord(_Record):
                 source=self.source,
                 time_s=self.time_s,
                 scale=Scale(s_x=self.s_x_mm, s_y=self.s_y_mm) if self.s_x_mm and self.s_y_mm else None,
-                T_patient_slice=None if self.T_patient_slice is None else np.array(self.T_patient_slice),
+                T_patient_slice=self._patient_from_slice,
                 thickness_mm=self.thickness_mm,
                 shape=(self.rows, self.columns) if self.rows and self.columns else None,
                 series=self.series,

@@ -99,7 +99,21 @@ def test_a_table_gives_back_what_went_in(tmp_path: Path, seed: int) -> None:
         if len(wanted.spots):
             assert got.info.thickness_mm == wanted.info.thickness_mm
             assert got.info.shape == wanted.info.shape
+            assert (got.info.T_patient_slice is None) == (wanted.info.T_patient_slice is None)
+            if wanted.info.T_patient_slice is not None:
+                np.testing.assert_allclose(got.info.T_patient_slice, wanted.info.T_patient_slice, rtol=0, atol=1e-14)
+    # of a slice without spots a table says no place: it is that of the slice before
+    assert [spot_slice.info.series for spot_slice in back] == ["0", "1", "1", "1"]
     assert written(back, tmp_path / "again.csv") == text
+
+
+def test_what_lies_where_in_a_table_is_written_as_dicom_has_it() -> None:
+    head = "slice,u_px,v_px,image_position_mm,image_orientation\n"
+    slices, _ = parse_spots((head + "0,1,2,-10\\20\\30.5,0.707\\0.707\\0\\0\\0\\-1\n").encode(), "t")
+    T = slices[0].info.T_patient_slice
+    assert T is not None
+    r = np.sqrt(0.5)
+    np.testing.assert_allclose(T, [[r, 0, -r, -10], [r, 0, r, 20], [0, -1, 0, 30.5], [0, 0, 0, 1]], atol=1e-12)
 
 
 @pytest.mark.parametrize("suffix", [".json", ".jsonl"])
