@@ -42,22 +42,37 @@ class MotionState:
     T: FloatArray
     #: (6,) of the frame's middle, mm/s and rad/s
     velocity: FloatArray
-    #: (12, 12) of pose and velocity
+    #: (12, 12) of pose and velocity, but for what lasts
     covariance: FloatArray
     #: intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
     intensity: tuple[float, float]
     information: tuple[float, float]
     #: time that the motion has been watched for
     elapsed_s: float = 0.0
+    #: (12, m) what errors that last (:mod:`.lasting`) do to pose and velocity, each of sd one; None: none
+    lasting: FloatArray | None = None
 
     @property
     def pose_covariance(self) -> FloatArray:
         """(6, 6) of the pose, about the frame's middle."""
-        return self.covariance[:6, :6]
+        return self._with_lasting(slice(6))
+
+    @property
+    def velocity_covariance(self) -> FloatArray:
+        """(6, 6) of the velocity of the frame's middle."""
+        return self._with_lasting(slice(6, 12))
+
+    def _with_lasting(self, part: slice) -> FloatArray:
+        covariance = self.covariance[part, part]
+        return covariance if self.lasting is None else covariance + self.lasting[part] @ self.lasting[part].T
 
 
 def start(
-    T: FloatArray, covariance: FloatArray, kind: Prediction, intensity: tuple[float, float] = FIRST_INTENSITY
+    T: FloatArray,
+    covariance: FloatArray,
+    kind: Prediction,
+    intensity: tuple[float, float] = FIRST_INTENSITY,
+    lasting: FloatArray | None = None,
 ) -> MotionState:
     """The motion of a frame seen once.
 
@@ -66,6 +81,7 @@ def start(
         covariance: (6, 6) of it.
         kind: ``velocity``, or ``identity``: the frame stays where it is but for chance.
         intensity: what was learnt of the motion before.
+        lasting: (6, m) what errors that last do to the pose, if any.
     """
     full = np.zeros((12, 12))
     full[:6, :6] = covariance
@@ -77,6 +93,7 @@ def start(
         covariance=full,
         intensity=intensity,
         information=(0.0, 0.0),
+        lasting=None if lasting is None else np.concatenate([lasting, np.zeros_like(lasting)]),
     )
 
 
@@ -99,6 +116,9 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
         place + _LEAST2[0] + dt_s * _DOUBT2[0],
         turn + _LEAST2[1] + dt_s * _DOUBT2[1],
     )
+    lasting = state.lasting
+    if lasting is not None and kind == "velocity":
+        lasting = np.concatenate([lasting[:6] + dt_s * lasting[6:], lasting[6:]])
     return MotionState(
         T=updated(state.T, dt_s * state.velocity),
         velocity=state.velocity,
@@ -106,11 +126,17 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
         intensity=state.intensity,
         information=state.information,
         elapsed_s=state.elapsed_s,
+        lasting=lasting,
     )
 
 
 def correct(
-    predicted: MotionState, innovation: FloatArray, covariance: FloatArray, dt_s: float, kind: Prediction
+    predicted: MotionState,
+    innovation: FloatArray,
+    covariance: FloatArray,
+    dt_s: float,
+    kind: Prediction,
+    lasting: FloatArray | None = None,
 ) -> MotionState:
     """The motion with a measured pose taken in.
 
@@ -120,8 +146,10 @@ def correct(
         covariance: (6, 6) of the measured pose.
         dt_s: time since the last measurement.
         kind: as for :func:`start`.
+        lasting: (6, m) what errors that last do to the measured pose, if any; ``covariance`` holds these too, as if
+            they were another in every slice: they can only be larger than what they do to the state.
     """
-    S_inverse = inverse_positive(predicted.pose_covariance + covariance)
+    S_inverse = inverse_positive(predicted.covariance[:6, :6] + covariance)
     gain = predicted.covariance[:, :6].dot(S_inverse)
     step = gain.dot(innovation)
     P = predicted.covariance - gain.dot(predicted.covariance[:6])
@@ -133,7 +161,15 @@ def correct(
         intensity=intensity,
         information=information,
         elapsed_s=predicted.elapsed_s + dt_s,
+        lasting=_lasting(predicted.lasting, gain, lasting),
     )
+
+
+def _lasting(predicted: FloatArray | None, gain: FloatArray, measured: FloatArray | None) -> FloatArray | None:
+    """(12, m) what errors that last do to the state once a measurement with the ``gain`` (12, 6) has been taken in."""
+    if measured is None:
+        return predicted if predicted is None else predicted - gain @ predicted[:6]
+    return gain @ measured if predicted is None else predicted + gain @ (measured - predicted[:6])
 
 
 def _learn(

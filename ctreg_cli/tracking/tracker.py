@@ -25,6 +25,7 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.matching import Matches, Scene, distinct, doubt, join, observations, search, weigh
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
+from ctreg_cli.registration.refine import covariance_from_information
 from ctreg_cli.registration.register import (
     LEAST_MATCHES,
     RIVAL_SD,
@@ -41,8 +42,10 @@ from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.gate import GATE_SD, Outlook, spread
+from ctreg_cli.tracking.lasting import lasting_influence
+from ctreg_cli.tracking.posterior import most_probable_pose
 from ctreg_cli.tracking.prior import PastPrior, Weighed
-from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo
+from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo, view
 from ctreg_cli.tracking.settle import (
     covering,
     covering_reconciled,
@@ -50,9 +53,15 @@ from ctreg_cli.tracking.settle import (
     reconciled,
     straightened,
 )
-from ctreg_cli.tracking.single import Crossing, carried, cross, difference, model_lines
+from ctreg_cli.tracking.single import Crossing, carried, cross, difference, greatest_tolerance_mm, model_lines
 from ctreg_cli.tracking.variants import with_other_rods
-from ctreg_cli.tracking.verify import CHECKABLE_MATCHES, agrees_with_past, verified
+from ctreg_cli.tracking.verify import (
+    CHECKABLE_MATCHES,
+    VAGUE_POSE_RAD,
+    agrees_with_past,
+    is_vaguer,
+    verified,
+)
 
 #: a pose farther from the prediction than this (χ² of six degrees of freedom: 4 in a million) is not a continuation
 CONTINUES_D2 = 35.0
@@ -70,6 +79,10 @@ _OPPOSED_WITHIN = 7.0
 _LEAST_WITH_PAST = 3
 #: so many spots where the past expects them speak for it even when they do not make a pose
 _MATCHES_THAT_AGREE = 4
+
+
+#: a past that knows place or turn no better (sd: sizes of the frame, rad) says nothing
+_NOWHERE_SIZES, _NOWHERE_RAD = 5.0, 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,6 +195,8 @@ class Tracker:
         T = axes.slice_pose(moved.T)
         G = axes.slice_twist(T)
         covariance = carried(G, moved.pose_covariance)
+        if _says_nothing(model, covariance):
+            return None
         crossing = cross(T, model_lines(model))
         spread_mm2 = spread(crossing, covariance)
         reach = np.sqrt(np.maximum(spread_mm2[:, 0, 0], spread_mm2[:, 1, 1]))
@@ -558,6 +573,7 @@ class Tracker:
         axes = self._axes(info)
         T, G = axes.pose(best.T_slice_model), axes.twist(best.T_slice_model)
         C = carried(G, best.covariance)
+        lasting = self._lasting(best, spots, scale, G)
         kind = self.options.prediction
         time_s, interval_s = info.time_s, 1.0
         if past is not None and prediction is not None:
@@ -568,10 +584,13 @@ class Tracker:
         timed = past is not None and (past.time_s is None) == (time_s is None)
         if prediction is None or not timed:
             learnt = past.motion.intensity if past is not None and timed else motion.FIRST_INTENSITY
-            state = motion.start(T, C, kind, learnt)
+            state = motion.start(T, C, kind, learnt, lasting)
         else:
             innovation = difference(T, prediction.motion.T)
-            state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind)
+            if is_vaguer(C, VAGUE_POSE_RAD):
+                desired = self._desired(best, spots, scale)
+                innovation, C = self._straight_innovation(desired, best, axes, prediction, innovation, C)
+            state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind, lasting)
         if method == "registered":
             self._kept_jacobian = np.nan_to_num(cross(best.T_slice_model, model_lines(model)).jacobian)
         tracked = Tracked(
@@ -593,6 +612,42 @@ class Tracker:
         )
         return tracked
 
+    def _desired(self, best: Candidate, spots: Spots, scale: Scale) -> Desired:
+        """The spots of a pose."""
+        uv, covariance = spots.uv_px.take(best.spot_index, axis=0), spots.covariance_px.take(best.spot_index, axis=0)
+        return Desired.of(self.model, best.rod_index, uv, covariance, scale.mm_per_px)
+
+    def _lasting(self, best: Candidate, spots: Spots, scale: Scale, to_still: FloatArray) -> FloatArray | None:
+        """(6, 2n) :func:`~.lasting.lasting_influence` on the frame's middle; None where rods are as drawn."""
+        if greatest_tolerance_mm(self.model) == 0:
+            return None
+        T = best.T_slice_model
+        seen = view(self._desired(best, spots, scale), T)
+        return to_still @ lasting_influence(self.model, T, best.rod_index, seen, scale.mm_per_px)
+
+    def _straight_innovation(
+        self,
+        desired: Desired,
+        best: Candidate,
+        axes: motion.StillAxes,
+        prediction: Prediction,
+        innovation: FloatArray,
+        covariance: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Innovation (6,) and covariance (6, 6) that take a badly known pose into the motion where both put it.
+
+        The spots' own pose may lie far along a curved valley, where its covariance does not hold: the spots are
+        linearised where the past leaves the frame (the iterated Kalman filter, Bell and Cathey 1993).
+        """
+        both = most_probable_pose(desired, prediction.T, prediction.covariance, best.T_slice_model)
+        if both is None:
+            return innovation, covariance
+        C, _ = covariance_from_information(both.information, self.model.size_mm)
+        gradient = both.seen.residual_px.reshape(-1) @ both.seen.weighted(both.seen.jacobian)
+        G = axes.twist(both.T)
+        there = difference(axes.pose(both.T), prediction.motion.T)
+        return there + G @ (C @ gradient), carried(G, C * best.inflation**2)
+
     def _velocity(self, state: motion.MotionState, to_still: FloatArray, info: SliceInfo) -> Velocity | None:
         """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known.
 
@@ -601,7 +656,7 @@ class Tracker:
         if self.options.prediction == "identity" or info.time_s is None or not state.elapsed_s > 0:
             return None
         G = motion.inverse_twist(to_still)
-        return Velocity(twist=G @ state.velocity, covariance=carried(G, state.covariance[6:, 6:]))
+        return Velocity(twist=G @ state.velocity, covariance=carried(G, state.velocity_covariance))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -614,6 +669,13 @@ class _Followed:
     outlook: Outlook
     #: why the constant Jacobian was given up for the one at hand; empty where it was not
     renewed: str = ""
+
+
+def _says_nothing(model: RodModel, covariance: FloatArray) -> bool:
+    """Whether a prediction with this covariance (6, 6) is no better than none."""
+    variances = covariance.diagonal().tolist()
+    place, turn = sum(variances[:3]), sum(variances[3:])
+    return not (place < (_NOWHERE_SIZES * model.size_mm) ** 2 and turn < _NOWHERE_RAD**2)
 
 
 def _unfit(moved: ServoResult) -> str:

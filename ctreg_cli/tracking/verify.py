@@ -34,7 +34,8 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.gate import Outlook
-from ctreg_cli.tracking.servo import Desired, ServoResult, view
+from ctreg_cli.tracking.posterior import most_probable_pose
+from ctreg_cli.tracking.servo import Desired, ServoResult
 from ctreg_cli.tracking.single import (
     determinant_2x2,
     difference,
@@ -55,8 +56,8 @@ CONTEST_D2 = 25.0
 CHANCE_IN_GATE = 0.003
 #: a prediction or a pose known worse than this (sd of the worst turn, rad) does not exclude a twin, or is not linear
 VAGUE_PREDICTION_RAD, VAGUE_POSE_RAD = math.radians(3.0), math.radians(1.5)
-#: steps to the pose most probable with the past; how far it may lie from the one without (χ² of six degrees of freedom)
-_MAP_STEPS, _AGREES_D2 = 6, 30.0
+#: how far the pose most probable with the past may lie from the one without (χ² of six degrees of freedom)
+_AGREES_D2 = 30.0
 #: nearer than this nothing is seen; farther off, the cost must have risen by this share of what the covariance says
 _NEAR_D2, _LEAST_RISE = 9.0, 0.5
 #: a pose off by more than this, in sd of the spots' information where the past puts the frame, is a surprise
@@ -102,7 +103,7 @@ def verified(
     chi2 = moved.chi2
     if len(rods) < CHECKABLE_MATCHES or float(chdtrc(dof, chi2)) < INFLATE_P or not _allowed(scene, T):
         return None
-    if _is_vaguer(C, VAGUE_POSE_RAD) or _is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
+    if is_vaguer(C, VAGUE_POSE_RAD) or is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
         return None
     crossings = outlook.crossing
     missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
@@ -181,23 +182,15 @@ def agrees_with_past(
     """
     spots = best.spot_index
     desired = Desired.of(model, best.rod_index, scene.xy_mm[spots], scene.covariance_mm[spots])
-    information = np.linalg.inv(predicted_covariance)
-    T = T_predicted
-    for _ in range(_MAP_STEPS):
-        here = view(desired, T)
-        if not np.isfinite(here.residual_px).all():
-            return False
-        WJ = here.weighted(here.jacobian)
-        gradient = WJ.T @ here.residual_px.reshape(-1) - information @ poses.difference(T, T_predicted)
-        T = poses.update(T, np.asarray(np.linalg.solve(WJ.T @ here.jacobian + information, gradient)))
-    apart = poses.difference(T, best.T_slice_model)
+    both = most_probable_pose(desired, T_predicted, predicted_covariance, best.T_slice_model)
+    if both is None:
+        return False
+    apart = poses.difference(both.T, best.T_slice_model)
     distance2 = float(apart @ np.linalg.solve(best.covariance, apart))
-    there = view(desired, T)
-    information = there.weighted(there.jacobian).T @ there.jacobian
-    if distance2 > _AGREES_D2 or is_surprising(apart, information):
+    if distance2 > _AGREES_D2 or is_surprising(apart, both.information):
         return False
     # the cost rises from its lowest point by the squared distance, if the covariance describes it
-    rise = there.chi2 - best.chi2
+    rise = both.seen.chi2 - best.chi2
     return distance2 < _NEAR_D2 or rise > _LEAST_RISE * distance2
 
 
@@ -218,7 +211,7 @@ def _allowed(scene: Scene, T: FloatArray) -> bool:
     return nominal is None or turned_by(T, nominal) <= scene.prior.max_angle_rad
 
 
-def _is_vaguer(covariance: FloatArray, limit_rad: float) -> bool:
+def is_vaguer(covariance: FloatArray, limit_rad: float) -> bool:
     """Whether the sd of the worst-known rotation exceeds ``limit_rad``."""
     turn = covariance[3:, 3:]
     if sum(turn.diagonal().tolist()) <= limit_rad**2:  # the variances of all axes together
