@@ -34,6 +34,8 @@ _ALONE_DECIDES = 9.0
 _INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 10.0
 #: what three sd must cost at least and at most (an ellipsoid: 9) for the past to have straightened a valley
 _LEAST_RISE, _MOST_RISE = 4.5, 18.0
+#: where that is looked at, sd, and what it must cost at least at the farther places
+_LOOKED_AT_SD, _LEAST_FAR_RISE = (3.0, 4.5, 6.0, 8.0), 12.0
 _PROFILE_STEPS = 4
 
 
@@ -151,15 +153,19 @@ def _is_straight(
     T_predicted: FloatArray,
     predicted_covariance: FloatArray,
 ) -> bool:
-    """Whether χ² of spots and past rises three sd along its weakest direction as the covariance (6, 6) says."""
+    """Whether χ² of spots and past rises along its weakest direction as the covariance (6, 6) says.
+
+    At three sd, and beyond: a valley may end in a wall there, and go on behind it.
+    """
     unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
     values, vectors = np.linalg.eigh(C * (unit[:, None] * unit))
     axes = vectors / unit[:, None]
     P_inverse = np.linalg.inv(predicted_covariance)
-    pair = Observations(
-        uv_px=np.repeat(seen.uv_px, 2, axis=0),
-        covariance_px=np.repeat(seen.covariance_px, 2, axis=0),
-        matched=np.repeat(seen.matched, 2, axis=0),
+    far = np.array([side * sd for sd in _LOOKED_AT_SD for side in (1.0, -1.0)])
+    several = Observations(
+        uv_px=np.repeat(seen.uv_px, len(far), axis=0),
+        covariance_px=np.repeat(seen.covariance_px, len(far), axis=0),
+        matched=np.repeat(seen.matched, len(far), axis=0),
         mm_per_px=seen.mm_per_px,
         half_slab_mm=seen.half_slab_mm,
     )
@@ -168,13 +174,13 @@ def _is_straight(
         past = poses.difference(stack, T_predicted)
         return np.asarray(linearise(model, stack, observed).chi2 + np.einsum("bi,ij,bj->b", past, P_inverse, past))
 
-    out = 3 * math.sqrt(float(values[-1])) * axes[:, -1]
-    moved = poses.update(np.repeat(T[None], 2, axis=0), np.stack([out, -out]))
+    out = math.sqrt(float(values[-1])) * axes[:, -1]
+    moved = poses.update(np.repeat(T[None], len(far), axis=0), far[:, None] * out)
     basis = axes[:, :-1]
     for _ in range(_PROFILE_STEPS):  # the other directions give way
-        H, g = linearise(model, moved, pair).normal_equations()
+        H, g = linearise(model, moved, several).normal_equations()
         g = g - poses.difference(moved, T_predicted) @ P_inverse
         step = np.linalg.solve(basis.T @ (H + P_inverse) @ basis, (g @ basis)[..., None])[..., 0]
         moved = poses.update(moved, step @ basis.T)
-    rise = cost(moved, pair) - cost(T[None], seen)
-    return bool(rise.min() >= _LEAST_RISE and rise.max() <= _MOST_RISE)
+    rise = cost(moved, several) - cost(T[None], seen)
+    return bool(rise.min() >= _LEAST_RISE and rise[:2].max() <= _MOST_RISE and rise[2:].min() >= _LEAST_FAR_RISE)
