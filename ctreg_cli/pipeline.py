@@ -255,7 +255,8 @@ def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | 
     """The tracked motion in hindsight: each ``ok`` pose becomes the one most probable given all slices of its motion.
 
     A motion ends where the frame jumped, or a new series begins; slices without a sure pose stay without one. A motion
-    of a few slices says too little of itself: its poses stay as they are.
+    of a few slices, or of slices of which only some have a time, says too little of itself: its poses stay as they are.
+    A smoothed pose has no protection level.
 
     Args:
         results: of :func:`track`, all of them.
@@ -267,7 +268,8 @@ def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | 
     starts = [n for n, i in enumerate(sure) if results[i].begins or not n]
     for first, end in pairwise([*starts, len(sure)]):
         places = sure[first:end]
-        if len(places) < LEAST_SLICES:
+        # numbers of slices do not stand in for some of the times
+        if len(places) < LEAST_SLICES or len({results[i].info.time_s is None for i in places}) > 1:
             continue
         motion = [_timed_pose(results[i], model) for i in places]
         if any(m.time_s < before.time_s for before, m in pairwise(motion)):
@@ -309,6 +311,8 @@ def _with_pose(result: FrameResult, model: RodModel, pose_: TimedPose, scale: Sc
         lambda_mm=frozen(seen.crossing.lambda_mm, (None,)),
         rms_px=seen.rms_px,
         chi2=seen.chi2,
+        # the level was that of the slice alone
+        protection_mm=frozen([], (None,)),
     )
     velocity = result.velocity
     if velocity is not None and pose_.velocity is not None and pose_.velocity_covariance is not None:

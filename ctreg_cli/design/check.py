@@ -30,6 +30,10 @@ MAX_RODS_LISTED = 50
 REDUNDANT_RODS = 5
 
 
+#: spots that make a pose without labels: three always fit
+LEAST_RODS = 4
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignReport:
     """A frame judged; shares and medians are over ``options.samples`` slices at random heights and tilts."""
@@ -122,6 +126,8 @@ def _remarks(
 ) -> Iterator[str]:
     if len(model) > MAX_RODS_LISTED:
         yield f"{len(model)} rods: sets are listed among the first {MAX_RODS_LISTED} only, symmetries not at all"
+    if len(model) < LEAST_RODS:
+        yield f"{len(model)} rods: poses with labels only; without, three spots always fit, and {LEAST_RODS} are needed"
     for i, j in coincident_pairs(model):
         yield f"rods {model.ids[i]} and {model.ids[j]} lie on one line, one over the other: written twice?"
     for twin in twins:

@@ -213,11 +213,9 @@ def fit_scales(slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model
     covariance = np.stack([slices[x.place].spots.covariance_px[x.spot_of_rod] for x in labelled])
     matched = np.stack([x.spot_of_rod >= 0 for x in labelled])
     T = np.stack([x.T for x in labelled])
-    return refine_scales(
-        model,
-        T,
-        Observations(uv_px=uv, covariance_px=covariance, matched=matched, mm_per_px=start.mm_per_px),
-    )
+    seen = Observations(uv_px=uv, covariance_px=covariance, matched=matched, mm_per_px=start.mm_per_px)
+    with np.errstate(invalid="ignore", divide="ignore"):  # what runs away is not believed
+        return refine_scales(model, T, seen)
 
 
 def _search_scales(
