@@ -26,9 +26,10 @@ from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
+from ctreg_cli.tracking.lasting import lasting_influence
 from ctreg_cli.tracking.motion import StillAxes
 from ctreg_cli.tracking.servo import Desired, view
-from ctreg_cli.tracking.smoother import LEAST_SLICES, TimedPose, lasting_covariance, smooth
+from ctreg_cli.tracking.smoother import LEAST_SLICES, TimedPose, smooth
 from ctreg_cli.tracking.tracker import Tracked, Tracker, Velocity
 
 
@@ -302,7 +303,8 @@ def _with_pose(result: FrameResult, model: RodModel, pose_: TimedPose, scale: Sc
     desired = Desired.of(model, rods, result.spots.uv_px[spots], result.spots.covariance_px[spots], used.mm_per_px)
     seen = view(desired, T)
     # rods beside their drawing err alike in all slices: what that adds to the pose is not averaged away
-    covariance = G @ pose_.covariance @ G.T + lasting_covariance(seen, desired)
+    lasting = lasting_influence(model, T, rods, seen, used.mm_per_px)
+    covariance = G @ pose_.covariance @ G.T + lasting @ lasting.T
     candidate = replace(
         best,
         T_slice_model=frozen(T, (4, 4)),

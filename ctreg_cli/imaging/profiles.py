@@ -184,20 +184,16 @@ class _Pixels(NamedTuple):
         clipped = None if self.clipped is None else self.clipped[which]
         return _Pixels(self.u, self.v, self.values[which], clipped, self.root_weights[which])
 
-    def rows(self, long: LongSpots) -> Rows:
-        """For profiles of which some are ``long``, seen along their own axes."""
-        if not len(long):
-            return Rows(self.u, self.v, self.values, self.clipped, self.root_weights)
-        along, across = long.coordinates(self.u, self.v)
-        return Rows(along, across, self.values, self.clipped, self.root_weights, long.mask)
+    def rows(self, long: LongSpots, reach: float | None = None, *, flat: bool = False) -> Rows:
+        """For profiles of which some are ``long``, seen along their own axes; or of ``flat`` ones.
 
-    def area_rows(self, long: LongSpots, reach: float, *, flat: bool = False) -> Rows:
-        """The same, the pixels up to ``reach`` from the middles taken as means over their areas."""
-        areas, u, v = Areas.within(self.u, self.v, reach)
-        if not len(long):
-            return Rows(u, v, self.values, self.clipped, self.root_weights, areas=areas, flat=flat)
-        along, across = long.coordinates(u, v)
-        return Rows(along, across, self.values, self.clipped, self.root_weights, long.mask, areas, flat=flat)
+        Pixels up to ``reach`` from the middles are means over their areas; None: all are points.
+        """
+        areas, u, v = (None, self.u, self.v) if reach is None else Areas.within(self.u, self.v, reach)
+        mask = None
+        if len(long):
+            (u, v), mask = long.coordinates(u, v), long.mask
+        return Rows(u, v, self.values, self.clipped, self.root_weights, mask, areas, flat=flat)
 
 
 class _Fitted(NamedTuple):
@@ -265,10 +261,8 @@ def _fit_flat(pixels: _Pixels, first: FloatArray, radius: int) -> _Fitted:
     """Fit edges about flat tops, from the ``first`` parameters (10, k), in windows of this radius."""
     none = LongSpots.none(first.shape[1])
     steep = np.log(2.0) * np.exp(first[FLATNESS] + np.maximum(first[SHAPE][0], first[SHAPE][2])) > SHARP
-    if pixels.clipped is not None or steep.any():
-        rows = pixels.area_rows(none, _reach(first, radius), flat=True)
-    else:
-        rows = Rows(*pixels, flat=True)
+    points_do = pixels.clipped is None and not steep.any()
+    rows = pixels.rows(none, None if points_do else _reach(first, radius), flat=True)
     return _Fitted(*fit(rows, first), rows.by_spot, none)
 
 
@@ -285,7 +279,7 @@ def _fit_sharp(blobs: Blobs, pixels: _Pixels, n_clipped: IntArray, brightest: Fl
         first: (10, k) parameters of spots that are not long, to start from.
     """
     reach = _reach(first, blobs.radius)
-    rows = pixels.area_rows(LongSpots.none(len(blobs)), reach)
+    rows = pixels.rows(LongSpots.none(len(blobs)), reach)
     start = first.copy()
     start[FLATNESS] = SHARP_START_LOG_BETA
     parameters, normal = fit(rows, start)
@@ -293,7 +287,7 @@ def _fit_sharp(blobs: Blobs, pixels: _Pixels, n_clipped: IntArray, brightest: Fl
     if len(shown):
         few = shown.index
         long = shown.take(few)
-        again = pixels.take(few).area_rows(long, reach)
+        again = pixels.take(few).rows(long, reach)
         start = _start(blobs.take(few), n_clipped[few], brightest[:, few], long)
         parameters[:, few], normal[few] = fit(again, start)
         rows.by_spot[few] = again.by_spot

@@ -61,11 +61,10 @@ def _descended(desired: Desired, T: FloatArray, T_predicted: FloatArray, past: F
     seen, off, cost = seen_from(T)
     if not math.isfinite(cost):
         return None
-    damping, done = 0.0, False
+    damping = 0.0
     for _ in range(_MOST_STEPS):
         WJ = seen.weighted(seen.jacobian)
-        information = WJ.T @ seen.jacobian
-        both = information + past
+        both = WJ.T @ seen.jacobian + past
         pull = seen.residual_px.reshape(-1) @ WJ - past @ off
         step = np.asarray(np.linalg.solve(both + damping * np.diag(both.diagonal()), pull), dtype=np.float64)
         moved2 = float(step @ both @ step)
@@ -77,11 +76,7 @@ def _descended(desired: Desired, T: FloatArray, T_predicted: FloatArray, past: F
         elif moved2 >= _DONE2:
             damping = max(10.0 * damping, _FIRST_DAMPING)
         if moved2 < _DONE2:
-            done = True
-            break
+            return Posterior(T=T, seen=seen, information=seen.weighted(seen.jacobian).T @ seen.jacobian, cost=cost)
         if damping > _MOST_DAMPING:
             break
-    if not done:
-        return None
-    WJ = seen.weighted(seen.jacobian)
-    return Posterior(T=T, seen=seen, information=WJ.T @ seen.jacobian, cost=cost)
+    return None

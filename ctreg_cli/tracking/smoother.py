@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.tracking.motion import FIRST_INTENSITY, FIRST_VELOCITY_SD
-from ctreg_cli.tracking.servo import Desired, View
 
 #: rounds of expectation maximisation, and the slices from which the motion is learnt: more add time, not knowledge
 ROUNDS, LEARN_FROM = 30, 400
@@ -85,17 +84,6 @@ def smooth(measured: Sequence[TimedPose]) -> list[TimedPose]:
         )
         for time, T, x, P in zip(times, nominal, passed.x, passed.P, strict=True)
     ]
-
-
-def lasting_covariance(seen: View, desired: Desired) -> FloatArray:
-    """(6, 6) what rods beside their drawing (the frame's ``tolerance``) add to a pose, in every slice alike."""
-    if not desired.tolerances.any():
-        return np.zeros((6, 6))
-    WJ = seen.weighted(seen.jacobian)
-    influence = np.linalg.solve(WJ.T @ seen.jacobian, WJ.T)
-    displaced = seen.covariance_px - desired.covariance_px
-    spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ displaced).transpose(1, 0, 2).reshape(6, -1)
-    return np.asarray(spread @ influence.T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
