@@ -20,7 +20,7 @@ from ctreg_cli.errors import InputError, MissingScaleError, SingularGeometryErro
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.registration.adjustment import BOW_SHARE, Adjustment, ScanSpots, adjust
-from ctreg_cli.registration.joint import register_joint, scan_spots, spot_of_rod
+from ctreg_cli.registration.joint import register_joint, scan_spots
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import across
 from ctreg_cli.registration.register import register
@@ -132,7 +132,7 @@ def _own_poses(
         if verdict.status == "ok" and verdict.best is not None:
             used.append(item)
             scales.append(own)
-            labels.append(spot_of_rod(model, verdict.best))
+            labels.append(verdict.best.spot_of_rod(len(model)))
             T.append(verdict.best.T_slice_model)
     if not used:
         raise SingularGeometryError("no slice gave a sure pose: see what each says with ctreg pose")

@@ -182,9 +182,9 @@ def _label(
     best = registration.best
     if registration.status != "ok" or best is None or len(best.rod_index) < _LEAST_SPOTS:
         return None
-    spot_of_rod = np.full(len(model), -1, dtype=np.intp)
-    spot_of_rod[best.rod_index] = best.spot_index
-    return _Labelled(place=place, T=best.T_slice_model, spot_of_rod=spot_of_rod, log_odds=best.log_odds)
+    return _Labelled(
+        place=place, T=best.T_slice_model, spot_of_rod=best.spot_of_rod(len(model)), log_odds=best.log_odds
+    )
 
 
 def _register_loosely(

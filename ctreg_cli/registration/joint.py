@@ -262,7 +262,7 @@ class _Fit:
 
 def _fit(views: list[_View], hypothesis: _Hypothesis, model: RodModel, options: RegistrationOptions) -> _Fit:
     """Fit to the slices that agree; then let all others look where the pose says rods are, and fit again."""
-    labels = {i: spot_of_rod(model, candidate) for i, candidate in hypothesis.members.items()}
+    labels = {i: candidate.spot_of_rod(len(model)) for i, candidate in hypothesis.members.items()}
     fit = _fit_labelled(views, labels, model, hypothesis.T)
     before: object = None
     for _ in range(2):
@@ -297,13 +297,6 @@ def _fit_labelled(views: list[_View], labels: dict[int, IntArray], model: RodMod
         scan=scan,
         found=_model_found(model, found),
     )
-
-
-def spot_of_rod(model: RodModel, candidate: Candidate) -> IntArray:
-    """(n,) the spot a candidate gives each rod, −1 for none."""
-    result = np.full(len(model), -1, dtype=np.intp)
-    result[candidate.rod_index] = candidate.spot_index
-    return result
 
 
 def scan_spots(
@@ -431,7 +424,7 @@ def _candidate(view: _View, fit: _Fit, model: RodModel, options: RegistrationOpt
     rods = np.nonzero(label >= 0)[0]
     missing = np.nonzero(_must_show(view, model, T) & (label < 0))[0]
     residual = lin.residual_px[0, rods]
-    mine = spot_of_rod(model, view.registration.candidates[0]) if view.candidates else None
+    mine = view.registration.candidates[0].spot_of_rod(len(model)) if view.candidates else None
     agrees = mine is not None and bool((mine == label).all())
     return Candidate(
         T_slice_model=frozen(T, (4, 4)),

@@ -51,6 +51,12 @@ class Candidate:
     scale: Scale | None = None
     scale_covariance: FloatArray | None = None
 
+    def spot_of_rod(self, n_rods: int) -> IntArray:
+        """(n_rods,) the spot of each rod of the model, −1 for none."""
+        spots = np.full(n_rods, -1, dtype=np.intp)
+        spots[self.rod_index] = self.spot_index
+        return spots
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray, frozen
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.linearity import positive_part
 from ctreg_cli.registration.matching import Scene, observations
-from ctreg_cli.registration.refine import Observations, linearise
 from ctreg_cli.registration.register import RIVAL_SD, averaged
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.rods import RodModel
-from ctreg_cli.tracking.prior import Weighed, most_probable
+from ctreg_cli.tracking.posterior import most_probable_pose
+from ctreg_cli.tracking.prior import Weighed
+from ctreg_cli.tracking.servo import Desired
+from ctreg_cli.tracking.valley import Valley, walked_along
 from ctreg_cli.tracking.verify import is_surprising
 
 #: a rival is reconciled when the verdict's pose would be this little wrong (χ² of six degrees of freedom) if it is true
@@ -32,11 +35,10 @@ _ALONE_DECIDES = 9.0
 #: a match that moves the pose by more than this (χ² of six degrees of freedom) must be better supported than
 #: 20,000 : 1 (ln), or the covariance has to cover the pose without it
 _INFLUENTIAL_D2, _WELL_SUPPORTED = 20.0, 10.0
-#: what three sd must cost at least and at most (an ellipsoid: 9) for the past to have straightened a valley
-_LEAST_RISE, _MOST_RISE = 4.5, 18.0
-#: where that is looked at, sd, and what it must cost at least at the farther places
-_LOOKED_AT_SD, _LEAST_FAR_RISE = (3.0, 4.5, 6.0, 8.0), 12.0
-_PROFILE_STEPS = 4
+#: a spot of a badly known pose that is supported by less than this (ln odds) is in doubt
+_SPOT_IN_DOUBT = 5.0
+#: a cost that rises by a lesser share of what an ellipsoid promises, or three sd out by a greater, is none
+_LEAST_RISE, _MOST_RISE = 0.16, 2.0
 
 
 def reconciled(weighed: Weighed) -> BoolArray:
@@ -67,8 +69,7 @@ def _as_candidate(best: Candidate, weighed: Weighed, row: int) -> Candidate:
 def lacking(model: RodModel, weighed: Weighed, best: Candidate) -> BoolArray:
     """(b,) matches that are the best one without some of its spots."""
     spot_of_rod = weighed.matches.spot_of_rod
-    own = np.full(len(model), -1, dtype=np.intp)
-    own[best.rod_index] = best.spot_index
+    own = best.spot_of_rod(len(model))
     less: BoolArray = ((spot_of_rod == own) | (spot_of_rod < 0)).all(axis=1) & (spot_of_rod != own).any(axis=1)
     return less
 
@@ -103,6 +104,36 @@ def covering(model: RodModel, weighed: Weighed, best: Candidate) -> Candidate:
     return replace(best, covariance=frozen(covariance, (6, 6)))
 
 
+def covering_less(
+    model: RodModel,
+    scene: Scene,
+    weighed: Weighed,
+    best: Candidate,
+    T_predicted: FloatArray,
+    predicted_covariance: FloatArray,
+) -> Candidate | None:
+    """``best``, badly known, with a covariance that covers what is left open without each spot that is in doubt.
+
+    Where the past is vague as well, a false spot lies in a rod's gate easily, and makes a bent valley look closed.
+
+    Returns:
+        None where the pose is out of the question without such a spot.
+    """
+    less = lacking(model, weighed, best) & (weighed.matches.log_odds > best.log_odds - _SPOT_IN_DOUBT)
+    covariance = best.covariance
+    for row in np.nonzero(less)[0]:
+        spot_of_rod = weighed.matches.spot_of_rod[row]
+        rods = np.nonzero(spot_of_rod >= 0)[0]
+        there = Spotted(rods, spot_of_rod[rods], weighed.matches.T[row])
+        open_there = _left_open(model, scene, there, T_predicted, predicted_covariance)
+        if open_there is None:
+            return None
+        T, valley, _ = open_there
+        apart = poses.difference(T, best.T_slice_model)
+        covariance = covariance + positive_part(valley.covariance + np.outer(apart, apart) - covariance)
+    return replace(best, covariance=frozen(covariance, (6, 6)))
+
+
 def straightened(
     model: RodModel,
     scene: Scene,
@@ -113,9 +144,6 @@ def straightened(
 ) -> Candidate | None:
     """``best``, whose cost is no ellipsoid, with a covariance that holds where the past leaves of its valley a straight
     piece.
-
-    The pose stays that of the spots. Its error is then what lies between it and the most probable pose with the past
-    taken in, and that one's covariance, if the cost (spots and past) is an ellipsoid there.
 
     Args:
         model: the rods.
@@ -128,59 +156,73 @@ def straightened(
     Returns:
         None where the past does not settle it.
     """
-    seen = observations(scene, weighed.matches.spot_of_rod[:1])
-    nearby = most_probable(model, seen, T_predicted, predicted_covariance)
-    T, C = nearby.T[0], nearby.covariance[0]
-    if not nearby.found[0] or not _is_straight(model, seen, T, C, T_predicted, predicted_covariance):
+    covered = covering_valley(model, scene, best, T_predicted, predicted_covariance, only_straight=True)
+    if covered is None:
         return None
-    apart = poses.difference(T, best.T_slice_model)
-    if is_surprising(apart, nearby.fit.normal_equations()[0][0]):
-        return None
-    covered = best.covariance + positive_part(C + np.outer(apart, apart) - best.covariance)
-    best = replace(best, covariance=frozen(covered, (6, 6)))
-    others = weighed.matches.log_odds > best.log_odds - _RIVALS_WITHIN
+    others = weighed.matches.log_odds > covered.log_odds - _RIVALS_WITHIN
     others[0] = False
-    if (weighed.distance2(best.T_slice_model, best.covariance)[others] > RIVAL_SD**2).any():
+    if (weighed.distance2(covered.T_slice_model, covered.covariance)[others] > RIVAL_SD**2).any():
         return None
-    return covering_reconciled(best, weighed.subset(others))
+    return covering_reconciled(covered, weighed.subset(others))
 
 
-def _is_straight(
+def covering_valley(
     model: RodModel,
-    seen: Observations,
-    T: FloatArray,
-    C: FloatArray,
+    scene: Scene,
+    best: Candidate,
     T_predicted: FloatArray,
     predicted_covariance: FloatArray,
-) -> bool:
-    """Whether χ² of spots and past rises along its weakest direction as the covariance (6, 6) says.
+    *,
+    only_straight: bool = False,
+) -> Candidate | None:
+    """``best`` with a covariance that covers what spots and past together leave open.
 
-    At three sd, and beyond: a valley may end in a wall there, and go on behind it.
+    The pose stays that of the spots. Its error is then what lies between it and the most probable pose with the past
+    taken in, and what the valley of the cost (spots and past) leaves open there.
+
+    Args:
+        model: the rods.
+        scene: the spots.
+        best: the pose.
+        T_predicted: (4, 4) where the past expected the frame.
+        predicted_covariance: (6, 6) of it.
+        only_straight: whether that valley has to be much like an ellipsoid.
+
+    Returns:
+        None where it is not, where there is no such pose, and where it takes this one for none of its spots'.
     """
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
-    values, vectors = np.linalg.eigh(C * (unit[:, None] * unit))
-    axes = vectors / unit[:, None]
-    P_inverse = np.linalg.inv(predicted_covariance)
-    far = np.array([side * sd for sd in _LOOKED_AT_SD for side in (1.0, -1.0)])
-    several = Observations(
-        uv_px=np.repeat(seen.uv_px, len(far), axis=0),
-        covariance_px=np.repeat(seen.covariance_px, len(far), axis=0),
-        matched=np.repeat(seen.matched, len(far), axis=0),
-        mm_per_px=seen.mm_per_px,
-        half_slab_mm=seen.half_slab_mm,
-    )
+    there = Spotted(best.rod_index, best.spot_index, best.T_slice_model)
+    found = _left_open(model, scene, there, T_predicted, predicted_covariance)
+    if found is None:
+        return None
+    T, valley, information = found
+    apart = poses.difference(T, best.T_slice_model)
+    if is_surprising(apart, information):
+        return None
+    if only_straight and (valley.least_share < _LEAST_RISE or valley.steepest_share > _MOST_RISE):
+        return None
+    wider = positive_part(valley.covariance + np.outer(apart, apart) - best.covariance)
+    return replace(best, covariance=frozen(best.covariance + wider, (6, 6)))
 
-    def cost(stack: FloatArray, observed: Observations) -> FloatArray:
-        past = poses.difference(stack, T_predicted)
-        return np.asarray(linearise(model, stack, observed).chi2 + np.einsum("bi,ij,bj->b", past, P_inverse, past))
 
-    out = math.sqrt(float(values[-1])) * axes[:, -1]
-    moved = poses.update(np.repeat(T[None], len(far), axis=0), far[:, None] * out)
-    basis = axes[:, :-1]
-    for _ in range(_PROFILE_STEPS):  # the other directions give way
-        H, g = linearise(model, moved, several).normal_equations()
-        g = g - poses.difference(moved, T_predicted) @ P_inverse
-        step = np.linalg.solve(basis.T @ (H + P_inverse) @ basis, (g @ basis)[..., None])[..., 0]
-        moved = poses.update(moved, step @ basis.T)
-    rise = cost(moved, several) - cost(T[None], seen)
-    return bool(rise.min() >= _LEAST_RISE and rise[:2].max() <= _MOST_RISE and rise[2:].min() >= _LEAST_FAR_RISE)
+class Spotted(NamedTuple):
+    """Rods (k,) and their spots (k,), and the pose (4, 4) that these speak for."""
+
+    rods: IntArray
+    spots: IntArray
+    T: FloatArray
+
+
+def _left_open(
+    model: RodModel, scene: Scene, spotted: Spotted, T_predicted: FloatArray, predicted_covariance: FloatArray
+) -> tuple[FloatArray, Valley, FloatArray] | None:
+    """The pose (4, 4) most probable with the past, the valley about it, and the spots' information there (6, 6)."""
+    rods, spots, T = spotted
+    desired = Desired.of(model, rods, scene.xy_mm[spots], scene.covariance_mm[spots])
+    both = most_probable_pose(desired, T_predicted, predicted_covariance, T)
+    if both is None:
+        return None
+    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
+    spot_of_rod[0, rods] = spots
+    seen = observations(scene, spot_of_rod)
+    return both.T, walked_along(model, seen, both.T, T_predicted, predicted_covariance), both.information

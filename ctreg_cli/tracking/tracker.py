@@ -22,10 +22,11 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.linearity import positive_part
 from ctreg_cli.registration.matching import Matches, Scene, distinct, doubt, join, observations, search, weigh
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
-from ctreg_cli.registration.refine import covariance_from_information
+from ctreg_cli.registration.refine import Observations, covariance_from_information
 from ctreg_cli.registration.register import (
     LEAST_MATCHES,
     RIVAL_SD,
@@ -48,12 +49,15 @@ from ctreg_cli.tracking.prior import PastPrior, Weighed
 from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo, view
 from ctreg_cli.tracking.settle import (
     covering,
+    covering_less,
     covering_reconciled,
+    covering_valley,
     opposing,
     reconciled,
     straightened,
 )
 from ctreg_cli.tracking.single import Crossing, carried, cross, difference, greatest_tolerance_mm, model_lines
+from ctreg_cli.tracking.valley import walked_along
 from ctreg_cli.tracking.variants import with_other_rods
 from ctreg_cli.tracking.verify import (
     CHECKABLE_MATCHES,
@@ -426,18 +430,20 @@ class Tracker:
             others = refined_candidates(model, scene, spots, scale, weighed.matches.subset(rivals))
             return replace(verdict, status="ambiguous", reason="rival_pose", candidates=(best, *others))
         best = covering(model, weighed, best)
-        if best.covariance is not verdict.candidates[0].covariance:
-            best = protected(model, scene, best, self.options.registration)
-            limit_mm = self.options.registration.alert_limit_mm
-            if limit_mm is not None and best.protection_mm.max() > limit_mm:
-                return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
-        return replace(verdict, candidates=(best,))
+        if prediction is not None and weighed.near[0] and is_vaguer(best.covariance, VAGUE_POSE_RAD):
+            covered = covering_less(model, scene, weighed, best, prediction.T, prediction.covariance)
+            if covered is None:
+                return replace(verdict, status="ambiguous", reason="not_linear")
+            best = covered
+        if best.covariance is verdict.candidates[0].covariance:
+            return verdict
+        return self._protected(replace(verdict, candidates=(best,)), scene)
 
     def _straightened(
         self, verdict: Registration, weighed: Weighed, prediction: Prediction, scene: Scene, spots: Spots
     ) -> Registration:
         """A verdict ``not_linear``, or ``ok`` where the past leaves only a straight piece of the valley."""
-        model, options = self.model, self.options.registration
+        model = self.model
         best = straightened(model, scene, weighed, verdict.candidates[0], prediction.T, prediction.covariance)
         if best is None:
             return verdict
@@ -445,14 +451,12 @@ class Tracker:
         covariance, suspicion = covariance_with_misfit(model, best.T_slice_model, best.covariance, seen)
         if covariance is None or suspicion:
             return verdict
-        best = protected(model, scene, best, options)
-        if options.alert_limit_mm is not None and best.protection_mm.max() > options.alert_limit_mm:
-            return Registration(status="no_pose", reason="unprotected", n_spots=len(spots))
         warnings = (
             ("curved_cost", "the cost is no ellipsoid along its weakest direction; the past settles the pose"),
             *fit_warnings(model, spots, best),
         )
-        return replace(verdict, status="ok", reason="", candidates=(best,), warnings=warnings)
+        straight = replace(verdict, status="ok", reason="", candidates=(best,), warnings=warnings)
+        return self._protected(straight, scene)
 
     def _is_opposed(self, best: Candidate, matches: Matches, prediction: Prediction, scene: Scene) -> bool:
         """Whether the past speaks for another pose than one that was believed without it."""
@@ -463,11 +467,27 @@ class Tracker:
         return bool(((weighed.matches.log_odds > own - _OPPOSED_WITHIN) & (distance2 > RIVAL_SD**2)).any())
 
     def _straight(self, verdict: Registration, prediction: Prediction, scene: Scene) -> Registration:
-        """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``."""
+        """A pose that continues the past only thanks to a covariance too straight for it is not ``ok``.
+
+        A badly known one gets a covariance that holds along the valley of the cost.
+        """
         best = verdict.candidates[0]
-        if agrees_with_past(self.model, scene, best, prediction.T, prediction.covariance):
+        past = prediction.T, prediction.covariance
+        if is_vaguer(best.covariance, VAGUE_POSE_RAD):
+            covered = covering_valley(self.model, scene, best, *past)
+            if covered is not None:
+                return self._protected(replace(verdict, candidates=(covered,)), scene)
+        elif agrees_with_past(self.model, scene, best, *past):
             return verdict
         return replace(verdict, status="ambiguous", reason="not_linear")
+
+    def _protected(self, verdict: Registration, scene: Scene) -> Registration:
+        """A verdict ``ok`` whose covariance was widened, with the protection levels of that; or why it is none."""
+        best = protected(self.model, scene, verdict.candidates[0], self.options.registration)
+        limit_mm = self.options.registration.alert_limit_mm
+        if limit_mm is not None and best.protection_mm.max() > limit_mm:
+            return Registration(status="no_pose", reason="unprotected", n_spots=verdict.n_spots)
+        return replace(verdict, candidates=(best,))
 
     # --- 3. register -------------------------------------------------------------------------------------------------
 
@@ -508,7 +528,12 @@ class Tracker:
         if prediction is not None and follows_on:
             verdict = self._straight(verdict, prediction, scene)
         if verdict.status != "ok":
-            return self._lost(verdict, prediction, scene)
+            lost = self._lost(verdict, prediction, scene)
+            if prediction is not None and verdict.reason == "rival_pose":
+                alone = self._decided(matches, None, scene, spots, scale)
+                if alone.status == "ok" and not continues(alone.candidates[0], prediction):
+                    self._past = None  # it is no longer certain that the frame is where the past has it
+            return lost
         if why:
             verdict = replace(verdict, warnings=(*verdict.warnings, ("registered_anew", why)))
         if self._past is not None and not follows_on:
@@ -588,8 +613,7 @@ class Tracker:
         else:
             innovation = difference(T, prediction.motion.T)
             if is_vaguer(C, VAGUE_POSE_RAD):
-                desired = self._desired(best, spots, scale)
-                innovation, C = self._straight_innovation(desired, best, axes, prediction, innovation, C)
+                innovation, C = self._straight_innovation(best, spots, scale, axes, prediction, innovation, C)
             state = motion.correct(prediction.motion, innovation, C, prediction.dt_s, kind, lasting)
         if method == "registered":
             self._kept_jacobian = np.nan_to_num(cross(best.T_slice_model, model_lines(model)).jacobian)
@@ -627,8 +651,9 @@ class Tracker:
 
     def _straight_innovation(
         self,
-        desired: Desired,
         best: Candidate,
+        spots: Spots,
+        scale: Scale,
         axes: motion.StillAxes,
         prediction: Prediction,
         innovation: FloatArray,
@@ -639,14 +664,22 @@ class Tracker:
         The spots' own pose may lie far along a curved valley, where its covariance does not hold: the spots are
         linearised where the past leaves the frame (the iterated Kalman filter, Bell and Cathey 1993).
         """
+        desired = self._desired(best, spots, scale)
         both = most_probable_pose(desired, prediction.T, prediction.covariance, best.T_slice_model)
         if both is None:
             return innovation, covariance
-        C, _ = covariance_from_information(both.information, self.model.size_mm)
+        seen = _observed(self.model, best, spots, scale)
+        valley = walked_along(self.model, seen, both.T, prediction.T, prediction.covariance)
+        # what the spots must say for the filter to end up knowing this much
+        information = positive_part(np.linalg.inv(valley.covariance) - np.linalg.inv(prediction.covariance))
+        C, _ = covariance_from_information(information, self.model.size_mm)
         gradient = both.seen.residual_px.reshape(-1) @ both.seen.weighted(both.seen.jacobian)
         G = axes.twist(both.T)
         there = difference(axes.pose(both.T), prediction.motion.T)
-        return there + G @ (C @ gradient), carried(G, C * best.inflation**2)
+        measured = there + G @ (C @ gradient)
+        C = carried(G, C * best.inflation**2)
+        # spots in doubt and rivals: no slice is believed more than its verdict says
+        return measured, C + positive_part(covariance - C)
 
     def _velocity(self, state: motion.MotionState, to_still: FloatArray, info: SliceInfo) -> Velocity | None:
         """The middle's velocity as the model origin's, slice axes; None where no time has passed, or none is known.
@@ -669,6 +702,17 @@ class _Followed:
     outlook: Outlook
     #: why the constant Jacobian was given up for the one at hand; empty where it was not
     renewed: str = ""
+
+
+def _observed(model: RodModel, best: Candidate, spots: Spots, scale: Scale) -> Observations:
+    """The spots of a pose, as refinement wants them."""
+    spot_of_rod = best.spot_of_rod(len(model))
+    return Observations(
+        uv_px=spots.uv_px[spot_of_rod][None],
+        covariance_px=spots.covariance_px[spot_of_rod][None],
+        matched=(spot_of_rod >= 0)[None],
+        mm_per_px=scale.mm_per_px,
+    )
 
 
 def _says_nothing(model: RodModel, covariance: FloatArray) -> bool:
