@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.tracking.servo import Desired, View, view
 from ctreg_cli.tracking.single import difference, updated
 
-#: steps at most; the last moves the pose by less than this (sd²)
-_MOST_STEPS, _DONE2 = 25, 1e-6
+#: steps at most; the last moves the pose by less than this (sd²), or, where a bent valley makes for a zigzag, than that
+_MOST_STEPS, _DONE2, _NEAR2 = 30, 1e-5, 0.25
 #: damping of a step that made things worse, to start from, and the most that is tried
 _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
 
@@ -61,11 +62,12 @@ def _descended(desired: Desired, T: FloatArray, T_predicted: FloatArray, past: F
     seen, off, cost = seen_from(T)
     if not math.isfinite(cost):
         return None
-    damping = 0.0
+    damping, moved2 = 0.0, math.inf
     for _ in range(_MOST_STEPS):
         WJ = seen.weighted(seen.jacobian)
-        both = WJ.T @ seen.jacobian + past
-        pull = seen.residual_px.reshape(-1) @ WJ - past @ off
+        turned = _turned(off)
+        both = WJ.T @ seen.jacobian + turned.T @ past @ turned
+        pull = seen.residual_px.reshape(-1) @ WJ - turned.T @ past @ off
         step = np.asarray(np.linalg.solve(both + damping * np.diag(both.diagonal()), pull), dtype=np.float64)
         moved2 = float(step @ both @ step)
         T_new = updated(T, step)
@@ -75,8 +77,20 @@ def _descended(desired: Desired, T: FloatArray, T_predicted: FloatArray, past: F
             damping *= 0.1
         elif moved2 >= _DONE2:
             damping = max(10.0 * damping, _FIRST_DAMPING)
-        if moved2 < _DONE2:
-            return Posterior(T=T, seen=seen, information=seen.weighted(seen.jacobian).T @ seen.jacobian, cost=cost)
-        if damping > _MOST_DAMPING:
+        if moved2 < _DONE2 or damping > _MOST_DAMPING:
             break
-    return None
+    if not moved2 < _NEAR2:
+        return None
+    return Posterior(T=T, seen=seen, information=seen.weighted(seen.jacobian).T @ seen.jacobian, cost=cost)
+
+
+def _turned(off: FloatArray) -> FloatArray:
+    """(6, 6) how the difference ``off`` (6,) from the prediction changes with a twist of the pose.
+
+    A large turn's axis comes along: the inverse left Jacobian of SO(3) (Barfoot, *State Estimation for Robotics*,
+    eq. 7.76) to fourth order.
+    """
+    x = skew(off[3:])
+    A = np.eye(6)
+    A[3:, 3:] += -0.5 * x + (x @ x) / 12.0 - (x @ x @ x @ x) / 720.0
+    return A
