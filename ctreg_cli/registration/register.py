@@ -63,6 +63,8 @@ _WORTH_SAYING = 1e-3
 _UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
 #: ln odds that a frame is not its drawing, or the spots are worse than they say
 _LOG_PRIOR_LOOSE = math.log(0.1)
+#: ln odds that a frame is not on its mount
+_LOG_PRIOR_OFF_MOUNT = math.log(0.01)
 #: two crossings nearer than this share of the frame's size may leave one spot, where nothing tells how large spots are
 _UNRESOLVED = 0.04
 #: matches below which nothing can be checked: three spots always fit
@@ -269,6 +271,8 @@ def decide(
     if not frame_is_known and _fits_better_loosely(model, scene, best):
         return refused("bad_fit")
     doubts, rivals = doubts_and_rivals(candidates, twins(model))
+    if not frame_is_known:
+        rivals += _rivals_off_the_mount(model, scene, spots, scale, best)
     if not rivals and best.log_odds - _log_others(matches) < accepted_log_odds(len(best.rod_index), len(spots)):
         return refused("no_consistent_match")
     warnings: list[tuple[str, str]] = []
@@ -416,6 +420,29 @@ def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool
         return True
     spot_of_rod = _spots_of_rods(model, best)[0]
     return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, matches) > -RIVAL_LOG_ODDS
+
+
+def _rivals_off_the_mount(
+    model: RodModel, scene: Scene, spots: Spots, scale: Scale, best: Candidate
+) -> list[Candidate]:
+    """Poses that the mount rules out, and that explain more spots than the one it allows.
+
+    A frame put on another way, or slices whose axes are not what the mount was given in, leave the cone without the
+    true pose; a chance match of some of its spots is what remains there.
+    """
+    n = len(best.rod_index)
+    if scene.prior.rotation is None or min(len(scene.xy_mm) - n, len(best.missing_rods)) < 1:
+        return []
+    anywhere = replace(scene, prior=_prior_of_rods(model))
+    matches = search(model, anywhere, least_matches=n + 1)
+    if matches is None:
+        return []
+    near = matches.log_odds + _LOG_PRIOR_OFF_MOUNT > best.log_odds - RIVAL_LOG_ODDS
+    near &= ~scene.prior.allows(matches.T[:, :3, :3])
+    if not near.any():
+        return []
+    found = refined_candidates(model, anywhere, spots, scale, matches.subset(near))
+    return _distinct_poses([c for c in found if chdtrc(c.degrees_of_freedom, c.chi2) >= BAD_FIT_P])
 
 
 def _fits_better_turned(model: RodModel, scene: Scene, best: Candidate) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
@@ -11,7 +12,7 @@ from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.scale import Scale
-from tests.oracle import OracleFrame, OracleScene, bound, random_frame, twist_error
+from tests.oracle import OracleFrame, OracleScene, bound, cross_rod, random_frame, twist_error
 from tests.registration.frames import frame_of, model_of, registered, scale_of, some_scene, spots_of
 
 CUBE = load_rod_model("rod-cube-30x30x40")
@@ -346,3 +347,33 @@ def test_a_frame_that_is_its_own_mirror_image_has_a_twin_seen_from_below(seed: i
     distances = [np.linalg.norm(error_of(c.T_slice_model, world)[3:]) for c in result.candidates]
     assert min(distances) < 0.1
     assert max(distances) > 1
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_a_mount_is_not_obeyed_against_the_spots(axis: str) -> None:
+    """A frame put on the other way round: what the mount leaves explains fewer spots, and is not ``ok``."""
+    model = load_rod_model("z-frame-z001")
+    assert model.mount is not None
+    half_turn = Rotation.from_euler(axis, 180, degrees=True).as_matrix()
+    against = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        tilt = poses.exp_rotation(rng.normal(size=3) * 0.1)
+        R = half_turn @ tilt @ np.asarray(model.mount.patient_from_model)
+        t = np.array([160.0, 160.0, rng.normal() * 0.2 * model.size_mm]) - R @ model.centre
+        hits = [cross_rod(a, b, R, t) for a, b in zip(model.starts, model.ends, strict=True)]
+        uv = np.array([hit[0] for hit in hits if hit is not None]) / 0.7
+        spots = Spots.from_points(uv + rng.normal(size=uv.shape) * 0.1, 0.1)
+        scale = Scale(s_x=0.7, s_y=0.7)
+        obeyed = register(spots, model, scale=scale)
+        if obeyed.status == "ok":
+            # a second pose of this frame, to which every spot agrees as well: nothing speaks against the mount
+            assert obeyed.best is not None
+            assert len(obeyed.best.rod_index) == len(uv), (seed, obeyed.best.rod_index)
+        elif obeyed.reason == "rival_pose":
+            turned = [
+                np.linalg.norm(twist_error(c.T_slice_model[:3, :3], c.T_slice_model[:3, 3], R, t)[3:])
+                for c in obeyed.candidates
+            ]
+            against += min(turned) < 0.1
+    assert against >= 4
