@@ -113,7 +113,7 @@ def register_joint(
         MissingScaleError: no slice has a scale, and none was given.
     """
     options = options or RegistrationOptions()
-    reasons = {place: reason for place, item in enumerate(slices) if (reason := _unusable(item, scale))}
+    reasons = {place: reason for place, item in enumerate(slices) if (reason := unusable(item, scale))}
     if len(reasons) == len(slices):
         _refuse(slices, reasons)
     views = [_view(place, item, model, scale, options) for place, item in enumerate(slices) if place not in reasons]
@@ -154,7 +154,7 @@ def _without_pose(slices: Sequence[SpotSlice], reason: str, reasons: dict[int, s
     return JointRegistration(status="no_pose", reason=reason, slices=rows, left_out=left_out)
 
 
-def _unusable(item: SpotSlice, scale: Scale | None) -> str:
+def unusable(item: SpotSlice, scale: Scale | None) -> str:
     """Why a slice cannot take part; empty when it can."""
     if item.problem:
         return "unreadable"
