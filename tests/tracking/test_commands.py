@@ -77,6 +77,23 @@ def test_tum_trajectory_holds_the_poses_of_the_table_in_metres(moving: tuple[Pat
         np.testing.assert_allclose(T, row.T_slice_model, atol=1e-6)
 
 
+@pytest.mark.parametrize("timeless", [{0, 1}, {5}, {0, 1, 7, 19}, set(range(20)), set()], ids=len)
+def test_seconds_and_slice_numbers_never_mix_in_a_trajectory(
+    moving: tuple[Path, Sequence], tmp_path: Path, timeless: set[int]
+) -> None:
+    header, *rows = (line.split(",") for line in moving[0].read_text().splitlines())
+    spots = tmp_path / "spots.csv"
+    later = [[n, "" if int(n) in timeless else str(100 + 0.25 * int(n)), *rest] for n, _, *rest in rows]
+    spots.write_text("".join(f"{','.join(row)}\n" for row in [header, *later]))
+    ctreg("pose", str(spots), "-m", CUBE, "-o", str(tmp_path / "t.tum"), "-o", str(tmp_path / "t.json"), "-q")
+    ctreg("export", str(tmp_path / "t.json"), "-o", str(tmp_path / "again.tum"), "--coordinates", "slice", "-q")
+    trajectory, again = np.loadtxt(tmp_path / "t.tum"), np.loadtxt(tmp_path / "again.tum")
+    times = [100 + 0.25 * n for n in range(20) if n not in timeless] or list(range(20))
+    np.testing.assert_allclose(trajectory[:, 0], times)
+    np.testing.assert_allclose(trajectory, again, atol=1e-6)
+    assert ("stands for the second" in (tmp_path / "t.tum").read_text()) == (len(timeless) == 20)
+
+
 def test_smoothed_motion_is_nearer_to_the_truth(moving: tuple[Path, Sequence], tmp_path: Path) -> None:
     spots, made = moving
     ctreg("track", str(spots), "-m", CUBE, "-o", str(tmp_path / "a.csv"), "--smooth", str(tmp_path / "b.csv"), "-q")
