@@ -25,7 +25,7 @@ from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
-from ctreg_cli.scale import Scale
+from ctreg_cli.scale import Scale, check_scale
 from ctreg_cli.tracking.lasting import lasting_influence
 from ctreg_cli.tracking.motion import StillAxes
 from ctreg_cli.tracking.servo import Desired, view
@@ -353,9 +353,12 @@ class _Scales:
 
     Raises:
         MissingScaleError: no slice at hand has a scale, and none was given.
+        InputError: what was given, or a slice has, is no scale.
     """
 
     def __init__(self, slices: Iterable[SliceLike], given: Scale | None) -> None:
+        if given is not None:
+            check_scale(given)
         self._is_known = given is not None
         self._lacking = ""
         if isinstance(slices, Sequence):
@@ -365,7 +368,9 @@ class _Scales:
 
     def note(self, slice_: SliceLike) -> None:
         """Take a slice into account."""
-        self._is_known = self._is_known or slice_.info.scale is not None
+        if slice_.info.scale is not None:
+            check_scale(slice_.info.scale)
+            self._is_known = True
         if not self._lacking and (isinstance(slice_, Slice) or not slice_.problem):
             self._lacking = slice_.info.name
 
