@@ -92,11 +92,16 @@ def _parse_table(text: str, name: str) -> list[SliceRecord]:
     except ValidationError as error:
         for mistake in error.errors():
             index, *inside = mistake["loc"]
-            mistakes.append(f"{name}:{groups[int(index)].line_of(inside)}: {_sentence(mistake, inside[-1:])}")
+            mistakes.append(f"{name}:{groups[int(index)].line_of(inside)}: {_sentence(mistake, _column_of(inside))}")
         records = []
     if mistakes:
         raise _error(sorted(mistakes, key=_line_of_message))
     return _placed(sorted(records, key=lambda record: record.slice))
+
+
+def _column_of(inside: Sequence[int | str]) -> list[str]:
+    """The column where a mistake was found in a record, if it is one column's: places in lists are no columns."""
+    return [part for part in inside if isinstance(part, str) and part != "spots"][:1]
 
 
 def _placed(records: Sequence[SliceRecord]) -> list[SliceRecord]:
@@ -173,7 +178,7 @@ class _SliceRows:
 
     def line_of(self, inside: Sequence[int | str]) -> int:
         """Line of the place inside the record where a mistake was found."""
-        return self.lines[int(inside[1])] if len(inside) > 1 else self.first_line
+        return self.lines[int(inside[1])] if inside[:1] == ["spots"] and len(inside) > 1 else self.first_line
 
 
 def _parse_json(text: str, name: str) -> list[SliceRecord]:
