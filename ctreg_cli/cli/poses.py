@@ -139,7 +139,9 @@ def _explain(result: FrameResult, talk: Talk) -> None:
     """One slice in a line, and its warnings in one each."""
     words = f"slice {result.index} ({result.info.source}): {result.status} {result.reason}".rstrip()
     for best in accepted(result)[:1]:
-        words += f", {len(best.rod_index)} of {len(result.spots)} spots matched, {best.rms_px:.3g} px rms"
+        words += f", {len(best.rod_index)} of {len(result.spots)} spots matched"
+        if len(best.rod_index):
+            words += f", {best.rms_px:.3g} px rms"
     talk.explain(words)
     for code, text in result.warnings:
         talk.explain(f"  {code}: {text}")

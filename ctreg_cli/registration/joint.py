@@ -8,6 +8,7 @@ slices that are sure of another pose are named and left out. Then one pose is fi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -442,7 +443,7 @@ def _candidate(view: _View, fit: _Fit, model: RodModel, options: RegistrationOpt
         lambda_mm=frozen(lin.lambda_mm[0, rods], (None,)),
         missing_rods=frozen_index(missing),
         missing_px=frozen(lin.predicted_px[0, missing], (None, 2)),
-        rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else 0.0,
+        rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else math.nan,
         chi2=float(lin.chi2[0]),
         degrees_of_freedom=2 * len(rods),
         log_odds=view.registration.candidates[0].log_odds if agrees else 0.0,
