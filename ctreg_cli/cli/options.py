@@ -29,11 +29,19 @@ class Jacobian(StrEnum):
 
 #: mm per pixel that anything in a scanner's room may have
 SCALES_MM = (1e-6, 1e3)
+#: px that a spot's place may be unsure by, as in a spots file
+SPOT_SDS_PX = (1e-6, 1e6)
 
 
 def _positive(value: float | None) -> float | None:
     if value is not None and not (math.isfinite(value) and value > 0):
         raise typer.BadParameter(f"{value:g} is not a positive number")
+    return value
+
+
+def _spot_sd(value: float | None) -> float | None:
+    if value is not None and not SPOT_SDS_PX[0] <= value <= SPOT_SDS_PX[1]:
+        raise typer.BadParameter(f"{value:g} is not between {SPOT_SDS_PX[0]:g} and {SPOT_SDS_PX[1]:g} px")
     return value
 
 
@@ -128,7 +136,7 @@ SpotSd = Annotated[
     typer.Option(
         "--spot-sd",
         metavar="PX",
-        callback=_positive,
+        callback=_spot_sd,
         show_default=False,
         help="Standard deviation of spots that come without one.  [default: 0.25]",
     ),

@@ -17,7 +17,7 @@ from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.interop.exports import ExportSink, split_outputs
 from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding, write_results
 from ctreg_cli.io.rod_file import load_rod_model
-from ctreg_cli.io.sinks import Sinks, check_outputs, open_sinks
+from ctreg_cli.io.sinks import STANDARD_OUTPUT, Sinks, check_outputs, open_sinks
 from ctreg_cli.pipeline import FrameResult, smoothed
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -72,6 +72,8 @@ def run_poses(
     session = session or Session()
     tables, exports = split_outputs(arguments.output)
     outputs = [] if exports and not tables else check_outputs(tables, arguments.inputs)
+    if smooth == STANDARD_OUTPUT:
+        raise InputError("--smooth -: name a file; standard output is for -o")
     if smooth is not None:
         check_outputs([*outputs, smooth], arguments.inputs)
     talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose, outputs=outputs)

@@ -244,8 +244,10 @@ class TrajectoryFile(Generic[Item]):
             raise InputError(f"-o {path}: a trajectory holds poses, and there are none here; use .csv, .json or .jsonl")
         self._lines = encoding.trajectory
         self._file = AtomicFile(path)
-        self._file.stream.write(encoding.trajectory_header + "\n")
-        self._body = self._file.stream.tell() if self._file.stream.seekable() else None
+        header = encoding.trajectory_header + "\n"
+        self._file.stream.write(header)
+        #: where the poses begin
+        self._body = len(header.encode())
         self._has_times: bool | None = None
         self._n_numbered = 0
 
@@ -259,7 +261,7 @@ class TrajectoryFile(Generic[Item]):
     def _write_timed(self, line: Stamped, time_s: float) -> None:
         stream = self._file.stream
         if self._has_times is False:
-            if self._body is None:  # a pipe gives nothing back: go on with numbers
+            if not self._file.can_rewind:  # go on with numbers
                 stream.write(f"{line.number:.6f} {line.text}\n")
                 return
             stream.seek(self._body)

@@ -58,6 +58,11 @@ def open_sources(inputs: Sequence[str], *, series: int | None = None, spot_sd_px
         InputError: images and spots mixed, several spots files, a path that is not there, or nothing usable.
         SpotsFileError: mistakes in the spots file.
     """
+    if not all(map(str.strip, inputs)):
+        # pathlib takes no name for the current folder
+        raise InputError(
+            "an input has no name (is a variable of the shell empty?); name files, a folder, or . for this one"
+        )
     tables = [name for name in inputs if _is_spots(name)]
     if not tables:
         # pydicom and Pillow are needed for images only

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +94,19 @@ def test_seconds_and_slice_numbers_never_mix_in_a_trajectory(
     np.testing.assert_allclose(trajectory[:, 0], times)
     np.testing.assert_allclose(trajectory, again, atol=1e-6)
     assert ("stands for the second" in (tmp_path / "t.tum").read_text()) == (len(timeless) == 20)
+
+
+def test_what_a_pipe_has_taken_is_not_taken_back(moving: tuple[Path, Sequence], tmp_path: Path) -> None:
+    header, *rows = (line.split(",") for line in moving[0].read_text().splitlines())
+    spots, pipe = tmp_path / "spots.csv", tmp_path / "pipe.tum"
+    later = [[n, "" if int(n) < 3 else n, *rest] for n, _, *rest in rows]
+    spots.write_text("".join(f"{','.join(row)}\n" for row in [header, *later]))
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor() as reader:
+        read = reader.submit(pipe.read_text)
+        ctreg("pose", str(spots), "-m", CUBE, "-o", str(pipe), "-q")
+        lines = read.result(timeout=60).splitlines()
+    assert [float(line.split()[0]) for line in lines if not line.startswith("#")] == list(range(20))
 
 
 def test_smoothed_motion_is_nearer_to_the_truth(moving: tuple[Path, Sequence], tmp_path: Path) -> None:
