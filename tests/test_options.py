@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,16 @@ import pytest
 from ctreg_cli import (
     InputError,
     MissingScaleError,
+    Mount,
     RegistrationOptions,
+    RodModelError,
     Scale,
     SegmentationOptions,
+    Slice,
     SliceInfo,
     Spots,
     SpotSlice,
+    Target,
     TrackingOptions,
     calibrate,
     load_rod_model,
@@ -129,6 +134,46 @@ def test_some_of_the_spots_are_what_they_were() -> None:
     np.testing.assert_array_equal(some.sd_px, np.full((2, 2), 0.1))
     assert not some.uv_px.flags.writeable
     assert len(spots.take(np.zeros(len(spots), dtype=bool))) == 0
+
+
+def test_a_frame_made_in_memory_is_held_to_what_a_file_is() -> None:
+    first, *others = FRAME.rods
+    for change, words in (
+        ({"tolerance_mm": -1}, "rod r1: tolerance_mm: -1"),
+        ({"tolerance_mm": math.nan}, "rod r1: tolerance_mm: nan"),
+        ({"diameter_mm": 0}, "rod r1: diameter_mm: 0"),
+    ):
+        with pytest.raises(RodModelError, match=words):
+            replace(FRAME, rods=(replace(first, **change), *others))
+    for point in ([0, 0, math.nan], [0, 0]):
+        with pytest.raises(RodModelError, match=r"target tip: .*three finite"):
+            replace(FRAME, targets=(Target(id="tip", point=np.array(point)),))
+    with pytest.raises(RodModelError, match="target ids must differ"):
+        replace(FRAME, targets=2 * (Target(id="tip", point=np.zeros(3)),))
+    for R in (np.ones((3, 3)), np.diag([1, 1, -1]), np.eye(2), np.full((3, 3), math.nan)):
+        with pytest.raises(RodModelError, match=r"patient_from_model: .*rotation"):
+            Mount(patient_from_model=R)
+    for angle in (0, -1, 181, math.nan):
+        with pytest.raises(RodModelError, match="max_angle_deg"):
+            Mount(patient_from_model=np.eye(3), max_angle_deg=angle)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stored": np.zeros((4, 4, 4))},
+        {"stored": np.zeros((0, 4))},
+        {"stored": [[1, 2], [3, 4]]},
+        {"stored": np.zeros((4, 4), dtype=complex)},
+        {"slope": 0},
+        {"slope": math.nan},
+        {"intercept": math.inf},
+    ],
+    ids=str,
+)
+def test_an_image_that_is_none_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(change))):
+        Slice(**{"info": SliceInfo(source="a"), "stored": np.zeros((4, 4)), **change})
 
 
 def test_calibrate_takes_a_stream_of_spots_and_no_images() -> None:

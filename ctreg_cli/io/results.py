@@ -13,6 +13,7 @@ import numpy as np
 
 from ctreg_cli._version import __version__
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.checks import demand
 from ctreg_cli.errors import InputError
 from ctreg_cli.geometry.pose import from_quaternion
 from ctreg_cli.io.sinks import FORMATS, STANDARD_OUTPUT, Encoding, cell, open_sinks, rounded
@@ -129,6 +130,7 @@ def write_results(
     Raises:
         InputError: another suffix, or a place that cannot be written.
     """
+    demand(isinstance(header, ResultsHeader), "header", header, "ResultsHeader(model=...)")
     if str(path) == STANDARD_OUTPUT:
         raise InputError(f"{path}: name a file; its suffix, one of {', '.join(FORMATS)}, chooses the format")
     with open_sinks([str(path)], results_encoding(header, with_uids=with_uids), io.StringIO()) as sinks:

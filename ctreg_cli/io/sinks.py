@@ -361,8 +361,8 @@ class Sinks(Generic[Item]):
                     try:
                         self._end(name, sink, finish)
                     except Exception:
-                        for _, other in self._sinks:
-                            other.abandon()
+                        for left in (sink, *(other for _, other in self._sinks)):
+                            left.abandon()
                         raise
         finally:
             self._handler.__exit__(None, None, None)

@@ -160,6 +160,9 @@ def test_what_is_no_result_is_said_to_be_none(tmp_path: Path) -> None:
         read_results(tmp_path / "p.json")
     with pytest.raises(InputError, match="name a file"):
         write_results([], "-", HEADER)
+    with pytest.raises(InputError, match=r"header: None .*ResultsHeader\(model="):
+        write_results([], tmp_path / "q.json", None)  # type: ignore[arg-type]
+    assert not list(tmp_path.glob("*q*"))
 
 
 def test_standard_deviations_are_roots_of_the_covariance_diagonal(tmp_path: Path, results: list[FrameResult]) -> None:
