@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ctreg_cli.imaging.spots import Spots
     from ctreg_cli.io.calibration_file import load_calibration
     from ctreg_cli.io.images import read_slices
-    from ctreg_cli.io.results import read_results, write_results
+    from ctreg_cli.io.results import PoseRow, ResultsHeader, read_results, write_results
     from ctreg_cli.io.rod_file import load_rod_model
     from ctreg_cli.io.spots_file import read_spots
     from ctreg_cli.pipeline import FrameResult, pose, segment, track
@@ -63,8 +63,10 @@ _HOME = {
     "InputError": "errors",
     "MissingScaleError": "errors",
     "Mount": "rods",
+    "PoseRow": "io.results",
     "Registration": "registration.result",
     "RegistrationOptions": "registration.options",
+    "ResultsHeader": "io.results",
     "Rod": "rods",
     "RodModel": "rods",
     "RodModelError": "errors",
@@ -106,8 +108,10 @@ __all__ = [
     "InputError",
     "MissingScaleError",
     "Mount",
+    "PoseRow",
     "Registration",
     "RegistrationOptions",
+    "ResultsHeader",
     "Rod",
     "RodModel",
     "RodModelError",

@@ -20,12 +20,12 @@ from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.joint import register_joint
+from ctreg_cli.registration.joint import register_joint, unusable
 from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Candidate, Registration, Status
 from ctreg_cli.rods import RodModel
-from ctreg_cli.scale import Scale
+from ctreg_cli.scale import Scale, check_scale
 from ctreg_cli.tracking.lasting import lasting_influence
 from ctreg_cli.tracking.motion import StillAxes
 from ctreg_cli.tracking.servo import Desired, view
@@ -127,17 +127,15 @@ def pose(
         segmentation: see :class:`SegmentationOptions`.
 
     Raises:
-        MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
+        MissingScaleError: no slice has a scale, and none was given; one of several without is a row ``no_scale``.
     """
     options = options or RegistrationOptions()
     segmentation = expecting(model, segmentation)
-    seen_scale = scale is not None
+    scales = _Scales(slices, scale)
     for place, item in enumerate(segment(slices, segmentation)):
-        seen_scale |= item.info.scale is not None
-        if seen_scale and scale is None and item.info.scale is None and not item.problem:
-            yield failure(place if item.index is None else item.index, item, "no_scale")
-            continue
+        scales.note(item)
         yield register_slice(place, item, model, scale=scale, options=options)
+    scales.settle()
 
 
 def register_slice(
@@ -147,10 +145,13 @@ def register_slice(
     index = place if item.index is None else item.index
     if item.problem:
         return failure(index, item, "unreadable")
+    used = scale or item.info.scale
+    if used is None:
+        return failure(index, item, "no_scale")
     registration = register(
         item.spots,
         model,
-        scale=scale_of(item, scale),
+        scale=used,
         T_patient_slice=item.info.T_patient_slice,
         thickness_mm=item.info.thickness_mm,
         shape=item.info.shape,
@@ -179,13 +180,18 @@ def pose_joint(
         segmentation: see :class:`SegmentationOptions`.
 
     Raises:
-        InputError: no slice of a series has a place in the patient.
-        MissingScaleError: no slice of a series has a scale, and none was given.
+        InputError: no slice has a place in the patient.
+        MissingScaleError: no slice has a scale, and none was given.
     """
     items = list(segment(slices, expecting(model, segmentation)))
     rows: dict[int, Registration] = {}
+    reasons = [unusable(item, scale) for item in items]
     for series in dict.fromkeys(item.info.series for item in items):
         places = [place for place, item in enumerate(items) if item.info.series == series]
+        if all(reasons[place] for place in places) and not all(reasons):  # another series has what this one lacks
+            for place in places:
+                rows[place] = Registration(status="no_pose", reason=reasons[place], n_spots=len(items[place].spots))
+            continue
         joint = register_joint([items[place] for place in places], model, scale=scale, options=options)
         rows.update(zip(places, joint.slices, strict=True))
     for place, item in enumerate(items):
@@ -212,19 +218,15 @@ def track(
         segmentation: see :class:`SegmentationOptions`.
 
     Raises:
-        MissingScaleError: the first slices have no scale and none was given; a later one without is a row ``no_scale``.
+        MissingScaleError: no slice has a scale, and none was given; one of several without is a row ``no_scale``.
     """
     segmentation = expecting(model, segmentation)
     tracker, follower = Tracker(model, options), Follower(segmentation)
-    seen_scale = scale is not None
+    scales = _Scales(slices, scale)
     for place, slice_ in enumerate(slices):
-        seen_scale |= slice_.info.scale is not None
-        if seen_scale and scale is None and slice_.info.scale is None and not getattr(slice_, "problem", ""):
-            tracker.miss()
-            item = spots_of(slice_, segmentation)
-            yield failure(place if item.index is None else item.index, item, "no_scale")
-            continue
+        scales.note(slice_)
         yield track_slice(place, slice_, tracker, follower, scale=scale)
+    scales.settle()
 
 
 def track_slice(
@@ -245,10 +247,12 @@ def track_slice(
                 return _tracked_result(place, item, tracker, tracked)
     follower.forget()
     item = spots_of(slice_, follower.options)
-    if item.problem:
+    used = scale or item.info.scale
+    if item.problem or used is None:
         tracker.miss()
-        return failure(place if item.index is None else item.index, item, "unreadable")
-    tracked = tracker.step(item.spots, item.info, scale_of(item, scale))
+        reason = "unreadable" if item.problem else "no_scale"
+        return failure(place if item.index is None else item.index, item, reason)
+    tracked = tracker.step(item.spots, item.info, used)
     return _tracked_result(place, item, tracker, tracked)
 
 
@@ -342,18 +346,43 @@ def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Trac
     return frame_result(index, item, tracker.model, tracked.registration, method=tracked.method, tracked=tracked)
 
 
-def scale_of(item: SpotSlice, override: Scale | None) -> Scale:
-    """The scale to use for a slice.
+class _Scales:
+    """Whether any slice of a run has a scale: one without is a row of its own, all without are no input.
+
+    Slices that are at hand are all asked before the first result; of others it is known only at their end.
 
     Raises:
-        MissingScaleError: it has none, and none was given.
+        MissingScaleError: no slice at hand has a scale, and none was given.
+        InputError: what was given, or a slice has, is no scale.
     """
-    scale = override or item.info.scale
-    if scale is None:
-        raise MissingScaleError(
-            f"{item.info.name}: no pixel scale in the input; give --scale SX SY (mm per pixel) or -c CALIBRATION"
-        )
-    return scale
+
+    def __init__(self, slices: Iterable[SliceLike], given: Scale | None) -> None:
+        if given is not None:
+            check_scale(given)
+        self._is_known = given is not None
+        self._lacking = ""
+        if isinstance(slices, Sequence):
+            for slice_ in slices:
+                self.note(slice_)
+            self.settle()
+
+    def note(self, slice_: SliceLike) -> None:
+        """Take a slice into account."""
+        if slice_.info.scale is not None:
+            check_scale(slice_.info.scale)
+            self._is_known = True
+        if not self._lacking and (isinstance(slice_, Slice) or not slice_.problem):
+            self._lacking = slice_.info.name
+
+    def settle(self) -> None:
+        """There are no more slices."""
+        if self._lacking and not self._is_known:
+            raise MissingScaleError(missing_scale(self._lacking))
+
+
+def missing_scale(name: str) -> str:
+    """What is said of a file, or the first of several, that has no scale."""
+    return f"{name}: no pixel scale in the input; give --scale SX SY (mm per pixel) or -c CALIBRATION"
 
 
 def failure(index: int, item: SpotSlice, reason: str) -> FrameResult:

@@ -8,8 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, frozen
+from ctreg_cli.checks import is_number
 from ctreg_cli.errors import RodModelError
 from ctreg_cli.geometry.plucker import moments
+
+#: how far a mount may be from a rotation, element by element
+_ROTATION_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,11 +32,24 @@ class Rod:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mount:
-    """How the frame normally sits: the rotation model → patient (LPS; slice axes without patient geometry)."""
+    """How the frame normally sits: the rotation model → patient (LPS; slice axes without patient geometry).
+
+    Raises:
+        RodModelError: what is given is no rotation, or the angle none.
+    """
 
     #: (3, 3)
     patient_from_model: FloatArray
     max_angle_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        R, angle = np.asarray(self.patient_from_model), self.max_angle_deg
+        if R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(R) > 0):
+            raise RodModelError(
+                f"mount: patient_from_model: {R.tolist()} is no rotation; give an orthonormal 3 × 3 matrix"
+            )
+        if not (is_number(angle) and 0 < angle <= 180):
+            raise RodModelError(f"mount: max_angle_deg: {angle!r} is wrong; give degrees above 0, up to 180")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +65,8 @@ class RodModel:
     """Rods of a frame (the frame file as data), with the stacked arrays the mathematics wants.
 
     Raises:
-        RodModelError: fewer than three rods, a duplicate id, a rod of no length, a coordinate that is not finite.
+        RodModelError: fewer than three rods, a duplicate id, a rod of no length, a coordinate that is not finite, a
+            diameter or a tolerance that is none.
     """
 
     name: str
@@ -79,6 +97,20 @@ class RodModel:
         ends = frozen([rod.end for rod in self.rods], (None, 3))
         if not (np.isfinite(starts).all() and np.isfinite(ends).all()):
             raise RodModelError(f"{self.name}: every coordinate must be a finite number")
+        for rod in self.rods:
+            diameter, tolerance = rod.diameter_mm, rod.tolerance_mm
+            if not (diameter is None or (is_number(diameter) and diameter > 0)):
+                raise RodModelError(
+                    f"{self.name}: rod {rod.id}: diameter_mm: {diameter!r} is no positive number, nor None"
+                )
+            if not (is_number(tolerance) and tolerance >= 0):
+                raise RodModelError(f"{self.name}: rod {rod.id}: tolerance_mm: {tolerance!r} is no number from 0")
+        target_ids = [target.id for target in self.targets]
+        if len(set(target_ids)) < len(target_ids):
+            raise RodModelError(f"{self.name}: target ids must differ, got {target_ids}")
+        for target in self.targets:
+            if np.shape(target.point) != (3,) or not np.isfinite(target.point).all():
+                raise RodModelError(f"{self.name}: target {target.id}: a point is three finite numbers, mm")
         lengths = np.linalg.norm(ends - starts, axis=1)
         if not (lengths > 1e-6).all():
             raise RodModelError(f"{self.name}: rod {ids[int(lengths.argmin())]} has no length")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ctreg_cli.errors import InputError
+from ctreg_cli.checks import demand, is_number
+from ctreg_cli.errors import InputError, MissingScaleError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +24,7 @@ class Scale:
 
     def __post_init__(self) -> None:
         for name, value in (("s_x", self.s_x), ("s_y", self.s_y)):
-            if not (math.isfinite(value) and value > 0):
+            if not (is_number(value) and value > 0):
                 raise InputError(f"{name}: {value!r} mm/px is not a positive number")
 
     @classmethod
@@ -36,3 +36,15 @@ class Scale:
     def mm_per_px(self) -> NDArray[np.float64]:
         """(2,) array ``[s_x, s_y]``: multiply (u, v) by it to get slice coordinates in mm."""
         return np.array([self.s_x, self.s_y])
+
+
+def check_scale(scale: object) -> None:
+    """Refuse what is given as a scale and is none; a bare pair does not say which of its numbers is s_x.
+
+    Raises:
+        MissingScaleError: it is None.
+        InputError: it is no :class:`Scale`.
+    """
+    if scale is None:
+        raise MissingScaleError("scale: there is none; give a ctreg_cli.Scale(s_x=..., s_y=...), mm per pixel")
+    demand(isinstance(scale, Scale), "scale", scale, "a ctreg_cli.Scale(s_x=..., s_y=...), mm per pixel")

@@ -27,6 +27,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         "rods",
         "geometry | imaging",
         "scale",
+        "checks",
         "arrays | errors | _version",
     )
 )

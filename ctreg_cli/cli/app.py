@@ -107,4 +107,9 @@ def main() -> None:
         # closed by the caller (``>&-``, a service): Python gives None, and what is said to nobody is no error
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w", encoding="utf-8"))
-    app()
+    try:
+        app()
+    except OSError as error:  # help and version are said before any command is run
+        console.error(f"standard output: {error.strerror or error}")
+        _let_go_of_closed_output()
+        sys.exit(EXIT_BAD_INPUT)

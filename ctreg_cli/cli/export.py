@@ -89,8 +89,14 @@ def export(
     contents = [
         select(document, space=coordinates.value if coordinates else kind.space, model=frame) for kind in formats
     ]
-    if any(kind.has_times for kind in formats) and not contents[0].has_times:
-        talk.warn(f"{results}: the slices have no time; their numbers stand for seconds")
+    if any(kind.has_times for kind in formats):
+        n_timeless = sum(record.time_s is None for record in document.ok)
+        if not contents[0].has_times:
+            talk.warn(f"{results}: the slices have no time; their numbers stand for seconds")
+        elif n_timeless:
+            talk.warn(
+                f"{results}: {n_timeless} of {len(document.ok)} poses have no time, and are left out of the motion"
+            )
     for name, content in zip(output, contents, strict=True):
         written = write_export(name, content, index=slice_number)
         what = str(written[0]) if len(written) == 1 else f"{len(written)} files {name}"

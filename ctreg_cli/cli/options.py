@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ctreg_cli.errors import InputError
 from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 
 
@@ -26,9 +27,32 @@ class Jacobian(StrEnum):
     constant = "constant"
 
 
+#: mm per pixel that anything in a scanner's room may have
+SCALES_MM = (1e-6, 1e3)
+#: px that a spot's place may be unsure by, as in a spots file
+SPOT_SDS_PX = (1e-6, 1e6)
+
+
 def _positive(value: float | None) -> float | None:
     if value is not None and not (math.isfinite(value) and value > 0):
         raise typer.BadParameter(f"{value:g} is not a positive number")
+    return value
+
+
+def _spot_sd(value: float | None) -> float | None:
+    if value is not None and not SPOT_SDS_PX[0] <= value <= SPOT_SDS_PX[1]:
+        raise typer.BadParameter(f"{value:g} is not between {SPOT_SDS_PX[0]:g} and {SPOT_SDS_PX[1]:g} px")
+    return value
+
+
+def scale_pair(value: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Refuse a ``--scale`` that is none."""
+    for name, number in zip(("s_x", "s_y"), value or (), strict=False):
+        if value and not SCALES_MM[0] <= number <= SCALES_MM[1]:
+            raise InputError(
+                f"--scale {value[0]:g} {value[1]:g}: {name}: {number:g} is no scale; "
+                f"give mm per pixel between {SCALES_MM[0]:g} and {SCALES_MM[1]:g}"
+            )
     return value
 
 
@@ -98,6 +122,7 @@ ScalePair = Annotated[
     typer.Option(
         "--scale",
         metavar="SX SY",
+        callback=scale_pair,
         help="Millimetres per pixel along columns and rows; overrides all others.",
         show_default=False,
     ),
@@ -111,7 +136,7 @@ SpotSd = Annotated[
     typer.Option(
         "--spot-sd",
         metavar="PX",
-        callback=_positive,
+        callback=_spot_sd,
         show_default=False,
         help="Standard deviation of spots that come without one.  [default: 0.25]",
     ),

@@ -17,7 +17,7 @@ from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.interop.exports import ExportSink, split_outputs
 from ctreg_cli.io.results import ResultsHeader, accepted, results_encoding, write_results
 from ctreg_cli.io.rod_file import load_rod_model
-from ctreg_cli.io.sinks import Sinks, check_outputs, open_sinks
+from ctreg_cli.io.sinks import STANDARD_OUTPUT, Sinks, check_outputs, open_sinks
 from ctreg_cli.pipeline import FrameResult, smoothed
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -72,6 +72,8 @@ def run_poses(
     session = session or Session()
     tables, exports = split_outputs(arguments.output)
     outputs = [] if exports and not tables else check_outputs(tables, arguments.inputs)
+    if smooth == STANDARD_OUTPUT:
+        raise InputError("--smooth -: name a file; standard output is for -o")
     if smooth is not None:
         check_outputs([*outputs, smooth], arguments.inputs)
     talk = Talk(quiet=arguments.quiet, verbose=arguments.verbose, outputs=outputs)
@@ -139,7 +141,9 @@ def _explain(result: FrameResult, talk: Talk) -> None:
     """One slice in a line, and its warnings in one each."""
     words = f"slice {result.index} ({result.info.source}): {result.status} {result.reason}".rstrip()
     for best in accepted(result)[:1]:
-        words += f", {len(best.rod_index)} of {len(result.spots)} spots matched, {best.rms_px:.3g} px rms"
+        words += f", {len(best.rod_index)} of {len(result.spots)} spots matched"
+        if len(best.rod_index):
+            words += f", {best.rms_px:.3g} px rms"
     talk.explain(words)
     for code, text in result.warnings:
         talk.explain(f"  {code}: {text}")

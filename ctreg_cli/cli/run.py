@@ -10,12 +10,13 @@ from typing import TypeVar
 import typer
 
 from ctreg_cli.cli.console import Talk, counted
+from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.imaging.slice import Slice, SliceInfo
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.interrupts import uninterrupted
 from ctreg_cli.io.sinks import Sinks
 from ctreg_cli.io.sources import Source, open_sources
-from ctreg_cli.pipeline import SliceLike
+from ctreg_cli.pipeline import SliceLike, missing_scale
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 
@@ -75,6 +76,7 @@ def choose_scale(
     Raises:
         InputError: a scale that is none.
         CalibrationFileError: the calibration file is wrong.
+        MissingScaleError: no slice has a scale, and none was given.
     """
     if pair is not None:
         if calibration is not None:
@@ -88,6 +90,8 @@ def choose_scale(
         if found.model_sha256 and found.model_sha256 != model.sha256:
             talk.warn(f"{calibration} was made with another frame file ({found.model_name}) than {model.name} here")
         return ScaleChoice(scale=found.scale, origin="calibration", stated=found.nominal, tolerance=NOMINAL_TOLERANCE)
+    if source.without_scale:  # known from headers: nobody waits for the pixels of a thousand slices to hear it
+        raise MissingScaleError(missing_scale(source.without_scale))
     return ScaleChoice(scale=None, origin="dicom" if source.kind == "images" else "spots")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ctreg_cli.cli.options import Gain, ModelName, Quiet
+from ctreg_cli.cli.options import Gain, ModelName, Quiet, scale_pair
 
 if TYPE_CHECKING:
     from ctreg_cli.tracking.experiment import Strategy
@@ -56,15 +56,17 @@ def servo(
             show_default=False,
         ),
     ] = None,
-    noise: Annotated[float, typer.Option("--noise", metavar="PX", min=0.0, help="Sd of the noise on the spots.")] = 0.0,
+    noise: Annotated[
+        float, typer.Option("--noise", metavar="PX", min=0.0, max=1e6, help="Sd of the noise on the spots.")
+    ] = 0.0,
     gain: Gain = 0.1,
     jacobian: Annotated[Strategies, typer.Option(help="Renewed at every step, or kept; both side by side.")] = (
         Strategies.both
     ),
-    scale: Annotated[tuple[float, float], typer.Option("--scale", metavar="SX SY", help="Millimetres per pixel.")] = (
-        0.488,
-        0.488,
-    ),
+    scale: Annotated[
+        tuple[float, float],
+        typer.Option("--scale", metavar="SX SY", callback=scale_pair, help="Millimetres per pixel."),
+    ] = (0.488, 0.488),
     runs: Annotated[int, typer.Option(min=1, max=MAX_RUNS, help="Runs, each with noise of its own.")] = 1,
     iterations: Annotated[int, typer.Option(min=1, max=MAX_ITERATIONS, help="Steps of a run.")] = 80,
     seed: Annotated[int, typer.Option(min=0, help="The same seed and options give the same bytes.")] = 0,
@@ -92,6 +94,7 @@ def servo(
 
     from ctreg_cli.cli.console import Talk
     from ctreg_cli.cli.servo_table import closing_words, servo_encoding
+    from ctreg_cli.errors import InputError, SingularGeometryError
     from ctreg_cli.io.rod_file import load_rod_model
     from ctreg_cli.io.sinks import check_outputs, open_sinks
     from ctreg_cli.report.servo_figure import check_figure_path, servo_figure, write_figure
@@ -107,13 +110,13 @@ def servo(
     mm_per_px = Scale(s_x=scale[0], s_y=scale[1])
     rng = np.random.default_rng(seed)
     settings = suitable_settings(rod_model, scale=mm_per_px)
-    T_desired = start_pose(desired or "centred", rod_model, settings, np.eye(3), rng)
+    T_desired = start_pose(desired or "centred", rod_model, settings, np.eye(3), rng, option="--to")
     if desired is None:
         T_desired = tilted(T_desired, rod_model, TILT_DEG)
     if start is None:
         T_start = displaced_start(T_desired, rod_model, np.array(SHIFT_MM), np.radians(TURN_DEG))
     else:
-        T_start = start_pose(start, rod_model, settings, np.eye(3), rng)
+        T_start = start_pose(start, rod_model, settings, np.eye(3), rng, option="--from")
     how = ExperimentSettings(gain=gain, noise_px=noise, iterations=iterations)
     strategies: list[Strategy] = ["updated", "constant"]
     if jacobian is not Strategies.both:
@@ -123,7 +126,12 @@ def servo(
         noise_of_run = np.random.default_rng([seed, run])  # both strategies meet the same noise
         return run_servo(rod_model, T_start, T_desired, mm_per_px, strategy, how, noise_of_run)
 
-    made = [[servo_with(strategy, run) for strategy in strategies] for run in range(runs)]
+    try:
+        made = [[servo_with(strategy, run) for strategy in strategies] for run in range(runs)]
+    except SingularGeometryError as error:
+        raise InputError(
+            f"{error}; give poses in which the slice cuts the same rods with --from and --to, and less --noise"
+        ) from error
     with open_sinks(outputs, servo_encoding(rod_model, made[0][0], mm_per_px), sys.stdout) as sinks:
         for number, together in enumerate(made):
             for one in together:

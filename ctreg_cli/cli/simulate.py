@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from ctreg_cli.cli.options import ModelName, Quiet
+from ctreg_cli.cli.options import ModelName, Quiet, scale_pair
 
 if TYPE_CHECKING:
     from ctreg_cli.simulation.motion import MotionKind
@@ -72,6 +72,7 @@ def simulate(
         tuple[float, float] | None,
         typer.Option(
             metavar="SX SY",
+            callback=scale_pair,
             help="Millimetres per pixel along columns and rows.  [default: the frame fits]",
             show_default=False,
         ),
@@ -154,7 +155,7 @@ def simulate(
             kind=cast("MotionKind", motion), amplitude_mm=amplitude_mm, amplitude_deg=amplitude_deg, period_s=period_s
         )
         times_s = slice_times(frames or DEFAULT_FRAMES, interval_s)
-        T_start = start_pose(start, rod_model, settings, R_patient_slice, rng)
+        T_start = start_pose(start, rod_model, settings, R_patient_slice, rng, option="--start")
         trajectory = move(tilted(T_start, rod_model, tilt_deg), rod_model.centre, times_s, how, rng)
     elif start != CENTRED or any(tilt_deg):
         raise InputError("--start and --tilt-deg cannot go with a motion file: its poses are used as they are")

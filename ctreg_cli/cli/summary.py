@@ -59,7 +59,8 @@ class PoseTally:
         for best in accepted(result)[:1]:
             self.n_poses += 1
             translation, rotation = _sd(best)
-            self.rms_px.append(best.rms_px)
+            if len(best.rod_index):  # a pose carried here from other slices has no residual
+                self.rms_px.append(best.rms_px)
             self.sd_mm.append(translation)
             self.sd_deg.append(rotation)
 
@@ -68,8 +69,9 @@ class PoseTally:
         rows = [("slices", str(self.total))]
         if self.outcomes:
             rows.append(("status", counted(self.outcomes)))
-        if self.n_poses:
+        if self.rms_px:
             rows.append(("residual", f"{statistics.median(self.rms_px):.3g} px rms"))
+        if self.n_poses:
             sds = f"{statistics.median(self.sd_mm):.2g} mm, {statistics.median(self.sd_deg):.2g}°"
             rows.append(("sd", f"{sds} (largest axis)"))
         if len(self.scales) == 1:

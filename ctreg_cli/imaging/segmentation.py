@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.checks import demand, is_number
 from ctreg_cli.imaging.blob import BACKGROUND_PX, Blobs, joined, measure_blobs, measure_lone_blobs
 from ctreg_cli.imaging.localisation import Centres, fit_centres
 from ctreg_cli.imaging.maxima import local_maxima, smoothed
@@ -41,7 +42,11 @@ Polarity = Literal["bright", "dark", "auto"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmentationOptions:
-    """Defaults suit CT and MR slices of any scanner; commands set the polarity, and diameters from their frame file."""
+    """Defaults suit CT and MR slices of any scanner; commands set the polarity, and diameters from their frame file.
+
+    Raises:
+        InputError: a value that is not allowed.
+    """
 
     #: whether rods are brighter or darker than what surrounds them; ``auto`` takes what stands out more
     polarity: Polarity = "bright"
@@ -55,6 +60,19 @@ class SegmentationOptions:
     min_relative_contrast: float = 0.1
     #: rods steeper than this against the slice normal are not looked for, degrees
     max_tilt_deg: float = 60.0
+
+    def __post_init__(self) -> None:
+        polarities, range_mm, most = get_args(Polarity), self.rod_diameter_mm, self.max_spots
+        sd, share, tilt = self.min_contrast_sd, self.min_relative_contrast, self.max_tilt_deg
+        demand(self.polarity in polarities, "polarity", self.polarity, f"one of {', '.join(map(repr, polarities))}")
+        is_range = range_mm is None or (
+            len(range_mm) == 2 and all(map(is_number, range_mm)) and 0 < range_mm[0] <= range_mm[1]
+        )
+        demand(is_range, "rod_diameter_mm", range_mm, "(least, greatest) in millimetres, or None")
+        demand(isinstance(most, int) and most > 0, "max_spots", most, "a whole number from 1")
+        demand(is_number(sd) and sd >= 0, "min_contrast_sd", sd, "a number from 0")
+        demand(is_number(share) and 0 <= share <= 1, "min_relative_contrast", share, "a share between 0 and 1")
+        demand(is_number(tilt) and 0 <= tilt < 90, "max_tilt_deg", tilt, "degrees from 0 to below 90")
 
 
 DEFAULT_OPTIONS = SegmentationOptions()
@@ -330,7 +348,7 @@ class _Rejections:
             inside = (np.linalg.norm(uv[:, None] - spots.uv_px, axis=2) < 0.5 * spots.minor_px).any(axis=1)
             counts -= Counter(r.reason for r, is_in in zip(rejected, inside, strict=True) if is_in)
             rejected = [r for r, is_in in zip(rejected, inside, strict=True) if not is_in]
-        return replace(spots, rejected=tuple(rejected), n_rejected=dict(counts))
+        return spots.with_rejected(tuple(rejected), dict(counts))
 
 
 def _blobs_at(
@@ -470,7 +488,7 @@ def _as_spots(
     faint = height[order] < options.min_contrast_sd * noise[order]
     rejections.add(uv[order[faint]], "low_contrast")
     keep = order[~faint]
-    return Spots(
+    return Spots.of_own(
         uv_px=uv[keep],
         covariance_px=np.concatenate([part.covariance_px for part in centres])[keep],
         area_px=np.concatenate([part.area for part in blobs])[keep],

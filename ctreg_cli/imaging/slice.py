@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctreg_cli.arrays import BoolArray, FloatArray
+from ctreg_cli.checks import demand, is_number
+from ctreg_cli.errors import InputError
 from ctreg_cli.scale import Scale
 
 
@@ -47,7 +49,11 @@ class SliceInfo:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Slice:
-    """One image: ``value = slope * stored + intercept`` (HU in CT)."""
+    """One image: ``value = slope * stored + intercept`` (HU in CT).
+
+    Raises:
+        InputError: no rows and columns of numbers, or a slope that makes all pixels alike.
+    """
 
     info: SliceInfo
     #: (rows, columns) as stored, any real dtype; not copied, treat as read-only
@@ -56,6 +62,14 @@ class Slice:
     intercept: float = 0.0
     #: inclusive range of stored values that mean "outside the image"; never metal, never air
     padding: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        stored = self.stored
+        if not (isinstance(stored, np.ndarray) and stored.ndim == 2 and stored.size and stored.dtype.kind in "biuf"):
+            what = f"{stored.dtype} {stored.shape}" if isinstance(stored, np.ndarray) else type(stored).__name__
+            raise InputError(f"stored: {what} is no image; give a (rows, columns) array of real numbers")
+        demand(is_number(self.slope) and self.slope != 0, "slope", self.slope, "a finite number that is not 0")
+        demand(is_number(self.intercept), "intercept", self.intercept, "a finite number")
 
     def values(self, rows: slice = slice(None), columns: slice = slice(None)) -> FloatArray:
         """Rescaled values (float64) of a window; padded pixels are NaN."""

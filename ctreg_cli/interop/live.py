@@ -10,12 +10,11 @@ from importlib import import_module
 
 import numpy as np
 
-from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.imaging.follow import Follower
 from ctreg_cli.imaging.segmentation import SegmentationOptions
 from ctreg_cli.imaging.slice import SliceInfo, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
-from ctreg_cli.pipeline import FrameResult, SliceLike, expecting, failure, no_spots, track_slice
+from ctreg_cli.pipeline import FrameResult, SliceLike, expecting, failure, missing_scale, no_spots, track_slice
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -57,14 +56,13 @@ def track_live(
     for place, slice_ in enumerate(slices):
         try:
             result = track_slice(place, slice_, tracker, follower, scale=scale)
-        except MissingScaleError as error:
-            on_fault(str(error))
-            result = failure(place, _without_spots(slice_), "no_scale")
         # the scanner does not wait: whatever breaks here is told, and the next slice starts afresh
         except Exception as error:  # noqa: BLE001
             on_fault(f"{slice_.info.source}: {type(error).__name__} inside ctreg; the frame is looked for anew")
             tracker, follower = Tracker(model, options), Follower(segmentation)
             result = failure(place, _without_spots(slice_), "internal_error")
+        if result.reason == "no_scale":
+            on_fault(missing_scale(slice_.info.name))
         yield result
 
 

@@ -33,11 +33,11 @@ class Content:
 
     @property
     def has_times(self) -> bool:
-        """Whether every usable slice has a time; else the numbers of the slices stand for seconds, of all of them."""
-        return all(record.time_s is not None for record in self.usable)
+        """Whether any usable slice has a time; else the numbers of the slices stand for seconds."""
+        return any(record.time_s is not None for record in self.usable)
 
     def timed(self, records: Iterable[SliceRecord]) -> Iterator[tuple[SliceRecord, float]]:
-        """Slices with their seconds; those without a time, where the usable ones have theirs, are left out."""
+        """Slices with their seconds; where any usable one has a time, those without are left out."""
         has_times = self.has_times
         for record in records:
             time_s = record.time_s if has_times else float(record.index)

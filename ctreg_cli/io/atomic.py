@@ -26,6 +26,8 @@ class AtomicFile:
         target = self.path.resolve()
         self._target = target
         self._direct = target.exists() and not target.is_file()
+        #: what was written can be taken back, as nothing can be of a device or a pipe
+        self.can_rewind = not self._direct
         self._partial = target if self._direct else target.with_name(f".{target.name}.{os.getpid()}.part")
         try:
             # open(), not tempfile: the file shall have the rights the user's umask gives

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from numpy.typing import NDArray
 
-from ctreg_cli.errors import UnreadableSliceError
+from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
 
 
@@ -75,6 +75,8 @@ class ImageRecord:
             return UnreadableSlice(info=self.info, problem=self.problem)
         try:
             stored = self.pixels.load()
-        except UnreadableSliceError as error:
+            return Slice(
+                info=self.info, stored=stored, slope=self.slope, intercept=self.intercept, padding=self.padding
+            )
+        except InputError as error:
             return UnreadableSlice(info=self.info, problem=str(error))
-        return Slice(info=self.info, stored=stored, slope=self.slope, intercept=self.intercept, padding=self.padding)

@@ -13,9 +13,10 @@ import numpy as np
 
 from ctreg_cli._version import __version__
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.checks import demand
 from ctreg_cli.errors import InputError
 from ctreg_cli.geometry.pose import from_quaternion
-from ctreg_cli.io.sinks import Encoding, open_sinks, rounded
+from ctreg_cli.io.sinks import FORMATS, STANDARD_OUTPUT, Encoding, cell, open_sinks, rounded
 from ctreg_cli.io.tum import HEADER, tum_lines
 from ctreg_cli.pipeline import FrameResult
 from ctreg_cli.registration.result import Candidate
@@ -25,6 +26,9 @@ from ctreg_cli.tracking.single import quaternion
 from ctreg_cli.tracking.tracker import Velocity
 
 SCHEMA = "ctreg/poses/1"
+#: digits cut off by a spreadsheet are no mistake
+_QUATERNION_TOLERANCE = 1e-3
+_REMEDY = "a pose table is what ctreg pose or ctreg track writes"
 
 #: columns of the pose table in order, with the significant digits of a number (None: as it is). 9 digits are under
 #: 1e-6 mm in a scanner's bore; a quaternion of 15 digits gives its rotation back to rounding error.
@@ -121,11 +125,14 @@ def results_encoding(header: ResultsHeader, *, with_uids: bool = False) -> Encod
 def write_results(
     results: Iterable[FrameResult], path: str | Path, header: ResultsHeader, *, with_uids: bool = False
 ) -> None:
-    """Write results to one file whose suffix (``.csv``, ``.json``, ``.jsonl``) chooses the format.
+    """Write results to one file whose suffix (``.csv``, ``.json``, ``.jsonl``, ``.tum``) chooses the format.
 
     Raises:
         InputError: another suffix, or a place that cannot be written.
     """
+    demand(isinstance(header, ResultsHeader), "header", header, "ResultsHeader(model=...)")
+    if str(path) == STANDARD_OUTPUT:
+        raise InputError(f"{path}: name a file; its suffix, one of {', '.join(FORMATS)}, chooses the format")
     with open_sinks([str(path)], results_encoding(header, with_uids=with_uids), io.StringIO()) as sinks:
         for result in results:
             sinks.write(result)
@@ -308,47 +315,71 @@ class PoseRow:
     reason: str
     #: (4, 4) model → slice, mm; None where the row holds no pose
     T_slice_model: FloatArray | None
-    #: every cell as written
+    #: every column of the table by name, as text
     cells: Mapping[str, str]
 
 
 def read_results(path: str | Path) -> list[PoseRow]:
-    """Rows of a pose table (CSV) as written by :func:`write_results`.
+    """The rows of results (``.csv``, ``.json``, ``.jsonl``) as written by :func:`write_results`.
 
     Raises:
-        InputError: not such a table; the message names file, line and column.
+        InputError: not such results; the message names file, line and column.
     """
+    if Path(path).suffix.lower() in (".json", ".jsonl"):
+        # documents need pydantic, and tables do not
+        from ctreg_cli.io.results_document import read_document
+
+        return [
+            PoseRow(
+                index=record.index,
+                source=record.source,
+                time_s=record.time_s,
+                status=record.status,
+                reason=record.reason,
+                T_slice_model=record.T_slice_model,
+                cells={name: cell(value) for name, value in record.columns.items()},
+            )
+            for record in read_document(path).records
+        ]
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a pose table") from error
+        why = f" ({error.strerror})" if isinstance(error, OSError) else ": is no UTF-8 text"
+        raise InputError(f"{path}: cannot be read as a pose table{why}; {_REMEDY}") from error
     reader = csv.DictReader(io.StringIO(text, newline=""))
     needed = ("slice", "status", "tx_mm", "ty_mm", "tz_mm", "qx", "qy", "qz", "qw")
     absent = [name for name in needed if name not in (reader.fieldnames or ())]
     if absent:
-        raise InputError(f"{path}: no column {', '.join(absent)}; a pose table is what ctreg pose or track writes")
-    return [_pose_row(row, f"{path}:{reader.line_num}") for row in reader]
+        raise InputError(f"{path}: no column {', '.join(absent)}; {_REMEDY}")
+    try:
+        return [_pose_row(row, f"{path}:{reader.line_num}") for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}:{reader.line_num}: {error}; {_REMEDY}") from error
 
 
 def _pose_row(row: Mapping[str, str], place: str) -> PoseRow:
     def numbers(*names: str) -> list[float]:
         try:
-            return [float(row[name]) for name in names]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{place}: {', '.join(names)}: a number is missing or is none") from error
+            values = [float(row[name]) for name in names]
+        except (TypeError, ValueError):
+            values = [math.nan]
+        if not all(map(math.isfinite, values)):
+            raise InputError(f"{place}: {', '.join(names)}: a number is missing or is none; {_REMEDY}")
+        return values
 
     cells = {key: value or "" for key, value in row.items() if key}
-    has_pose = bool(cells["qw"])
+    T = None
+    if cells["qw"]:
+        q = np.array(numbers("qx", "qy", "qz", "qw"))
+        if abs(np.linalg.norm(q) - 1) > _QUATERNION_TOLERANCE:
+            raise InputError(f"{place}: qx, qy, qz, qw: a quaternion of length 1 is needed; {_REMEDY}")
+        T = from_quaternion(q, np.array(numbers("tx_mm", "ty_mm", "tz_mm")))
     return PoseRow(
         index=int(numbers("slice")[0]),
         source=cells.get("source", ""),
         time_s=numbers("time_s")[0] if cells.get("time_s") else None,
         status=cells["status"],
         reason=cells.get("reason", ""),
-        T_slice_model=from_quaternion(
-            np.array(numbers("qx", "qy", "qz", "qw")), np.array(numbers("tx_mm", "ty_mm", "tz_mm"))
-        )
-        if has_pose
-        else None,
+        T_slice_model=T,
         cells=cells,
     )

@@ -33,6 +33,16 @@ STANDARD_OUTPUT = "-"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Stamped:
+    """A line of a trajectory without its time stamp."""
+
+    #: of the slice
+    number: int
+    time_s: float | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Encoding(Generic[Item]):
     """How one item (a slice's result, a slice's spots) becomes rows and records."""
 
@@ -46,7 +56,7 @@ class Encoding(Generic[Item]):
     #: key of the list of records in a JSON document
     records_key: str
     #: lines of a trajectory, and the comment above them; None where there is none
-    trajectory: Callable[[Item], Iterable[str]] | None = None
+    trajectory: Callable[[Item], Iterable[Stamped]] | None = None
     trajectory_header: str = ""
 
 
@@ -221,7 +231,9 @@ class JsonLinesFile(Generic[Item]):
 
 
 class TrajectoryFile(Generic[Item]):
-    """Lines of text, a pose each, that appear when complete.
+    """Lines of text, a pose each, that appear when complete; stamped with seconds, or all with slice numbers.
+
+    Whether any pose has a time may come out late. Numbers written by then are taken back, not the whole kept in mind.
 
     Raises:
         InputError: there are no poses in this encoding.
@@ -232,10 +244,42 @@ class TrajectoryFile(Generic[Item]):
             raise InputError(f"-o {path}: a trajectory holds poses, and there are none here; use .csv, .json or .jsonl")
         self._lines = encoding.trajectory
         self._file = AtomicFile(path)
-        self._file.stream.write(encoding.trajectory_header + "\n")
+        header = encoding.trajectory_header + "\n"
+        self._file.stream.write(header)
+        #: where the poses begin
+        self._body = len(header.encode())
+        self._has_times: bool | None = None
+        self._n_numbered = 0
 
     def write(self, item: Item) -> None:
-        self._file.stream.writelines(f"{line}\n" for line in self._lines(item))
+        for line in self._lines(item):
+            if line.time_s is None:
+                self._write_timeless(line)
+            else:
+                self._write_timed(line, line.time_s)
+
+    def _write_timed(self, line: Stamped, time_s: float) -> None:
+        stream = self._file.stream
+        if self._has_times is False:
+            if not self._file.can_rewind:  # go on with numbers
+                stream.write(f"{line.number:.6f} {line.text}\n")
+                return
+            stream.seek(self._body)
+            stream.truncate()
+            stream.write(f"# left out for want of a time: {self._n_numbered} poses at the start\n")
+        self._has_times = True
+        stream.write(f"{time_s:.6f} {line.text}\n")
+
+    def _write_timeless(self, line: Stamped) -> None:
+        stream = self._file.stream
+        if self._has_times:
+            stream.write(f"# left out for want of a time: slice {line.number}\n")
+            return
+        if self._has_times is None:
+            self._has_times = False
+            stream.write("# no times: the slice's number stands for the second\n")
+        self._n_numbered += 1
+        stream.write(f"{line.number:.6f} {line.text}\n")
 
     def finish(self) -> None:
         self._file.commit()
@@ -317,8 +361,8 @@ class Sinks(Generic[Item]):
                     try:
                         self._end(name, sink, finish)
                     except Exception:
-                        for _, other in self._sinks:
-                            other.abandon()
+                        for left in (sink, *(other for _, other in self._sinks)):
+                            left.abandon()
                         raise
         finally:
             self._handler.__exit__(None, None, None)

@@ -6,11 +6,15 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from ctreg_cli.errors import InputError
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.pipeline import SliceLike
+
+if TYPE_CHECKING:
+    from ctreg_cli.imaging.spot_slice import SpotSlice
+    from ctreg_cli.io.image_record import ImageRecord
 
 STANDARD_INPUT = "-"
 SPOTS_SUFFIXES = (".csv", ".json", ".jsonl")
@@ -32,6 +36,8 @@ class Source:
     #: reason → number of files in the folders that are no slices
     skipped: Mapping[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    #: where every readable slice is without a pixel scale: what to call them in a message; else empty
+    without_scale: str = ""
 
     def __len__(self) -> int:
         return len(self.slices)
@@ -52,13 +58,24 @@ def open_sources(inputs: Sequence[str], *, series: int | None = None, spot_sd_px
         InputError: images and spots mixed, several spots files, a path that is not there, or nothing usable.
         SpotsFileError: mistakes in the spots file.
     """
+    if not all(map(str.strip, inputs)):
+        # pathlib takes no name for the current folder
+        raise InputError(
+            "an input has no name (is a variable of the shell empty?); name files, a folder, or . for this one"
+        )
     tables = [name for name in inputs if _is_spots(name)]
     if not tables:
         # pydicom and Pillow are needed for images only
         from ctreg_cli.io.images import open_images
 
         images = open_images([Path(name) for name in inputs], series=series)
-        return Source(slices=images, kind="images", skipped=images.skipped, warnings=tuple(images.warnings))
+        return Source(
+            slices=images,
+            kind="images",
+            skipped=images.skipped,
+            warnings=tuple(images.warnings),
+            without_scale=_without_scale(images.records),
+        )
     if len(inputs) > 1:
         raise InputError(f"{' '.join(inputs)}: give either images or one spots file ({tables[0]} is a spots file)")
     (name,) = inputs
@@ -69,7 +86,16 @@ def open_sources(inputs: Sequence[str], *, series: int | None = None, spot_sd_px
 
     content, shown = (_standard_input(), "standard input") if name == STANDARD_INPUT else (read_bytes(name), name)
     slices, warnings = parse_spots(content, shown, spot_sd_px=spot_sd_px)
-    return Source(slices=slices, kind="spots", warnings=warnings)
+    lacking = _without_scale(slices) and f"{shown}: columns s_x_mm, s_y_mm"
+    return Source(slices=slices, kind="spots", warnings=warnings, without_scale=lacking)
+
+
+def _without_scale(slices: Sequence[SpotSlice] | Sequence[ImageRecord]) -> str:
+    """The first of slices that are all without a pixel scale; those that cannot be read have no say in it."""
+    readable = [item.info for item in slices if not item.problem]
+    if any(info.scale is not None for info in readable):
+        return ""
+    return next((info.name for info in readable), "")
 
 
 def _is_spots(name: str) -> bool:

@@ -12,11 +12,12 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from ctreg_cli.checks import demand, is_number
 from ctreg_cli.errors import SpotsFileError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.spots_file import COLUMNS, SCHEMA
-from ctreg_cli.io.spots_schema import SliceRecord, SpotsDocument
+from ctreg_cli.io.spots_schema import MAX_COORDINATE_PX, MIN_SD_PX, SliceRecord, SpotsDocument
 
 NEEDED = ("slice", "u_px", "v_px")
 #: what is the same in every line of a slice
@@ -43,6 +44,8 @@ def parse_spots(
     Raises:
         SpotsFileError: as :func:`ctreg_cli.io.spots_file.read_spots`.
     """
+    is_sd = is_number(spot_sd_px) and MIN_SD_PX <= spot_sd_px <= MAX_COORDINATE_PX
+    demand(is_sd, "spot_sd_px", spot_sd_px, f"pixels from {MIN_SD_PX:g} to {MAX_COORDINATE_PX:g}")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -92,11 +95,16 @@ def _parse_table(text: str, name: str) -> list[SliceRecord]:
     except ValidationError as error:
         for mistake in error.errors():
             index, *inside = mistake["loc"]
-            mistakes.append(f"{name}:{groups[int(index)].line_of(inside)}: {_sentence(mistake, inside[-1:])}")
+            mistakes.append(f"{name}:{groups[int(index)].line_of(inside)}: {_sentence(mistake, _column_of(inside))}")
         records = []
     if mistakes:
         raise _error(sorted(mistakes, key=_line_of_message))
     return _placed(sorted(records, key=lambda record: record.slice))
+
+
+def _column_of(inside: Sequence[int | str]) -> list[str]:
+    """The column where a mistake was found in a record, if it is one column's: places in lists are no columns."""
+    return [part for part in inside if isinstance(part, str) and part != "spots"][:1]
 
 
 def _placed(records: Sequence[SliceRecord]) -> list[SliceRecord]:
@@ -173,7 +181,7 @@ class _SliceRows:
 
     def line_of(self, inside: Sequence[int | str]) -> int:
         """Line of the place inside the record where a mistake was found."""
-        return self.lines[int(inside[1])] if len(inside) > 1 else self.first_line
+        return self.lines[int(inside[1])] if inside[:1] == ["spots"] and len(inside) > 1 else self.first_line
 
 
 def _parse_json(text: str, name: str) -> list[SliceRecord]:

@@ -21,12 +21,15 @@ from ctreg_cli.scale import Scale
 MAX_COORDINATE_PX = 1e6
 #: a standard deviation below this (px) is no measurement, but would outweigh every other spot
 MIN_SD_PX = 1e-6
+#: mm per pixel that an image may have
+SCALES_MM = (1e-6, 1e3)
 #: relative asymmetry of a covariance that is no mistake
 ROUNDING = 1e-9
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
 Sd = Annotated[float, Field(ge=MIN_SD_PX, le=MAX_COORDINATE_PX)]
 Positive = Annotated[float, Field(gt=0)]
+MmPerPx = Annotated[float, Field(ge=SCALES_MM[0], le=SCALES_MM[1])]
 Matrix2 = tuple[tuple[float, float], tuple[float, float]]
 Row4 = tuple[float, float, float, float]
 
@@ -104,8 +107,8 @@ class SliceRecord(_Record):
     slice: int = Field(ge=0)
     source: str = ""
     time_s: float | None = None
-    s_x_mm: Positive | None = None
-    s_y_mm: Positive | None = None
+    s_x_mm: MmPerPx | None = None
+    s_y_mm: MmPerPx | None = None
     thickness_mm: Positive | None = None
     rows: Annotated[int, Field(gt=0)] | None = None
     columns: Annotated[int, Field(gt=0)] | None = None

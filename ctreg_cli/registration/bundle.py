@@ -115,12 +115,13 @@ def _own_poses(
     slices: Sequence[SpotSlice], model: RodModel, scale: Scale | None, options: RegistrationOptions
 ) -> tuple[ScanSpots, FloatArray]:
     used, scales, labels, T = [], [], [], []
-    for item in slices:
-        if item.problem:
-            continue
+    readable = [item for item in slices if not item.problem]
+    if readable and scale is None and all(item.info.scale is None for item in readable):
+        raise MissingScaleError(f"{readable[0].info.name}: no pixel scale in the input; give one in mm per pixel")
+    for item in readable:
         own = scale or item.info.scale
         if own is None:
-            raise MissingScaleError(f"{item.info.name}: no pixel scale in the input; give one in mm per pixel")
+            continue
         verdict = register(
             item.spots,
             model,

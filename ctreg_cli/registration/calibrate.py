@@ -9,13 +9,14 @@ scanner has.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
 
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.checks import demand
 from ctreg_cli.errors import CalibrationError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
@@ -90,7 +91,7 @@ class _Labelled:
 
 
 def calibrate(
-    slices: Sequence[SpotSlice], model: RodModel, *, options: RegistrationOptions | None = None
+    slices: Iterable[SpotSlice], model: RodModel, *, options: RegistrationOptions | None = None
 ) -> CalibrationRun:
     """Estimate s_x and s_y with standard deviations from one or many slices.
 
@@ -101,8 +102,13 @@ def calibrate(
 
     Raises:
         CalibrationError: no scale between 0.1 and 2 mm/px explains the spots; the sentence says what was missing.
+        InputError: the slices are images, or something else than spots.
     """
     options = options or RegistrationOptions()
+    slices = list(slices)
+    for place, item in enumerate(slices):
+        what = type(item).__name__
+        demand(isinstance(item, SpotSlice), f"slices[{place}]", what, "spots: ctreg_cli.segment(slices, options)")
     usable = [place for place, item in enumerate(slices) if len(item.spots) >= _LEAST_SPOTS]
     if not usable:
         raise CalibrationError(

@@ -8,6 +8,7 @@ slices that are sure of another pose are named and left out. Then one pose is fi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -113,7 +114,7 @@ def register_joint(
         MissingScaleError: no slice has a scale, and none was given.
     """
     options = options or RegistrationOptions()
-    reasons = {place: reason for place, item in enumerate(slices) if (reason := _unusable(item, scale))}
+    reasons = {place: reason for place, item in enumerate(slices) if (reason := unusable(item, scale))}
     if len(reasons) == len(slices):
         _refuse(slices, reasons)
     views = [_view(place, item, model, scale, options) for place, item in enumerate(slices) if place not in reasons]
@@ -154,7 +155,7 @@ def _without_pose(slices: Sequence[SpotSlice], reason: str, reasons: dict[int, s
     return JointRegistration(status="no_pose", reason=reason, slices=rows, left_out=left_out)
 
 
-def _unusable(item: SpotSlice, scale: Scale | None) -> str:
+def unusable(item: SpotSlice, scale: Scale | None) -> str:
     """Why a slice cannot take part; empty when it can."""
     if item.problem:
         return "unreadable"
@@ -435,7 +436,7 @@ def _candidate(view: _View, fit: _Fit, model: RodModel, options: RegistrationOpt
         lambda_mm=frozen(lin.lambda_mm[0, rods], (None,)),
         missing_rods=frozen_index(missing),
         missing_px=frozen(lin.predicted_px[0, missing], (None, 2)),
-        rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else 0.0,
+        rms_px=float(np.sqrt((residual**2).mean())) if len(rods) else math.nan,
         chi2=float(lin.chi2[0]),
         degrees_of_freedom=2 * len(rods),
         log_odds=view.registration.candidates[0].log_odds if agrees else 0.0,

@@ -29,7 +29,7 @@ from ctreg_cli.registration.refine import (
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.registration.twins import Twin, twins, with_twins
 from ctreg_cli.rods import RodModel
-from ctreg_cli.scale import Scale
+from ctreg_cli.scale import Scale, check_scale
 
 #: a match is believed when its odds against chance, and against all other matches that contradict it together, exceed
 #: this (ln): chance is a rival like any other ...
@@ -150,7 +150,12 @@ def register(
         The verdict. ``ok`` is said only when the match beats chance by more than :data:`ACCEPT_LOG_ODDS`, fits (χ²),
         leaves no more rods unexplained than it explains, no other pose comes within :data:`RIVAL_LOG_ODDS`, and a
         covariance describes what the spots leave open.
+
+    Raises:
+        MissingScaleError: the scale is None.
+        InputError: the scale is no :class:`Scale`.
     """
+    check_scale(scale)
     options = options or RegistrationOptions()
     scene = make_scene(
         spots, model, scale, T_patient_slice=T_patient_slice, thickness_mm=thickness_mm, shape=shape, options=options

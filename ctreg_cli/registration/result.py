@@ -32,7 +32,7 @@ class Candidate:
     missing_rods: IntArray
     #: (r, 2) where those rods should be seen, px
     missing_px: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    #: root mean square of ``residual_px`` over both coordinates and all matches, px
+    #: root mean square of ``residual_px`` over both coordinates and all matches, px; NaN where there is no match
     rms_px: float
     #: χ² of the residuals (spot covariance and frame tolerance) and its degrees of freedom
     chi2: float

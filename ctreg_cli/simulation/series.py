@@ -70,7 +70,7 @@ def truth(index: int, simulated: SimulatedSlice) -> FrameResult:
     return FrameResult(
         index=index,
         info=simulated.slice.info,
-        spots=Spots(uv_px=simulated.uv_px, covariance_px=np.zeros((k, 2, 2))),
+        spots=Spots.without_error(simulated.uv_px),
         status="ok",
         reason="",
         method=METHOD,

@@ -24,6 +24,8 @@ RANDOM_TILT_DEG, RANDOM_PLACE, RANDOM_HEIGHT, RANDOM_TRIES = 20.0, 0.06, 0.25, 2
 WANTED_RODS = 6
 #: a rotation given in numbers may miss orthonormality by this
 ROTATION_TOLERANCE = 1e-3
+#: a frame farther off than this is in no scanner
+FARTHEST_MM = 1e5
 
 #: (row, column) directions of the usual planes in patient coordinates (LPS)
 PLANES: Mapping[str, tuple[float, ...]] = {
@@ -60,12 +62,23 @@ def parse_orientation(text: str) -> FloatArray:
 
 
 def start_pose(
-    text: str, model: RodModel, settings: ScannerSettings, R_patient_slice: FloatArray, rng: np.random.Generator
+    text: str,
+    model: RodModel,
+    settings: ScannerSettings,
+    R_patient_slice: FloatArray,
+    rng: np.random.Generator,
+    *,
+    option: str = "start",
 ) -> FloatArray:
     """(4, 4) pose ``T_slice_model``.
 
     Args:
         text: ``centred``, ``random``, or the seven numbers ``TX,TY,TZ,QX,QY,QZ,QW`` of a pose.
+        model: the frame.
+        settings: the image the frame is to be seen in.
+        R_patient_slice: (3, 3) slice axes in the patient.
+        rng: for ``random``.
+        option: where the text is from, for messages.
 
     Raises:
         InputError: none of these, or a quaternion that is not of length 1.
@@ -76,9 +89,13 @@ def start_pose(
         return random_pose(model, settings, R_patient_slice, rng)
     values = _numbers(text)
     if len(values) != 7:
-        raise InputError(f"start: {text!r} is neither centred, nor random, nor a pose TX,TY,TZ,QX,QY,QZ,QW")
+        raise InputError(
+            f"{option}: {text!r} is neither centred, nor random, nor a pose: seven finite numbers TX,TY,TZ,QX,QY,QZ,QW"
+        )
     if abs(math.hypot(*values[3:]) - 1) > ROTATION_TOLERANCE:
-        raise InputError(f"start: {text!r}: the quaternion QX,QY,QZ,QW must have length 1")
+        raise InputError(f"{option}: {text!r}: the quaternion QX,QY,QZ,QW must have length 1")
+    if max(map(abs, values[:3])) > FARTHEST_MM:
+        raise InputError(f"{option}: {text!r}: TX,TY,TZ are millimetres, none beyond {FARTHEST_MM:g}")
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
     T[:3, 3] = values[:3]

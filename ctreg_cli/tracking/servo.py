@@ -26,6 +26,7 @@ from ctreg_cli.tracking.single import (
     greatest_tolerance_mm,
     inverse_2x2,
     inverse_positive,
+    lambdas,
     lines_of,
     model_lines,
     solve_positive,
@@ -104,8 +105,8 @@ class View(NamedTuple):
     #: the rods and the slice, mm
     crossing: Crossing
 
-    def stepped(self, twist: FloatArray) -> View:
-        """What is seen after a small twist (6,), to first order in spots and residuals."""
+    def stepped(self, twist: FloatArray, lambda_mm: FloatArray) -> View:
+        """What is seen after a small twist (6,), to first order in spots and residuals; λ (k,) is what it is there."""
         shift = self.jacobian.dot(twist).reshape(-1, 2)
         return View(
             spots_px=self.spots_px + shift,
@@ -113,7 +114,7 @@ class View(NamedTuple):
             covariance_px=self.covariance_px,
             weight=self.weight,
             jacobian=self.jacobian,
-            crossing=self.crossing,
+            crossing=self.crossing._replace(lambda_mm=lambda_mm),
         )
 
     @property
@@ -257,7 +258,9 @@ def servo(
         if converged or iterations >= options.max_iterations:
             break
         if looks_no_more and moved_sd2 <= options.left_over_sd * before_sd:
-            T, here, iterations, converged = updated(T, step), here.stepped(step), iterations + 1, True
+            T = updated(T, step)
+            here = here.stepped(step, lambdas(T, desired.lines))
+            iterations, converged = iterations + 1, True
             break
         before_sd = math.sqrt(moved_sd2)
         turn = options.gain * math.hypot(*step[3:].tolist())

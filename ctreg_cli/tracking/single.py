@@ -95,6 +95,13 @@ def cross(T: FloatArray, columns: FloatArray) -> Crossing:
     )
 
 
+def lambdas(T: FloatArray, columns: FloatArray) -> FloatArray:
+    """(n,) :attr:`Crossing.lambda_mm` alone, at an eighth of the cost; not finite where a rod lies in the plane."""
+    a_z, d_z = T[2].dot(columns).reshape(2, -1)
+    lambda_mm: FloatArray = a_z / -d_z
+    return lambda_mm
+
+
 def updated(T: FloatArray, twist: FloatArray) -> FloatArray:
     """:func:`ctreg_cli.geometry.pose.update` of one pose."""
     v_x, v_y, v_z, x, y, z = twist.tolist()

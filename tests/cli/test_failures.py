@@ -82,6 +82,26 @@ def test_a_missing_scale_names_the_remedies(bare_spots: Path, tmp_path: Path, co
     assert list(tmp_path.iterdir()) == [bare_spots]
 
 
+@pytest.mark.parametrize("command", ["pose", "track"])
+def test_one_slice_without_scale_is_a_row_even_if_it_is_the_first(
+    spots_csv: Path, tmp_path: Path, command: str
+) -> None:
+    header, *rows = csv.reader(io.StringIO(spots_csv.read_text(encoding="utf-8")))
+    where = [header.index(name) for name in ("s_x_mm", "s_y_mm")]
+    bare = [["" if row[0] == "0" and place in where else cell for place, cell in enumerate(row)] for row in rows]
+    (tmp_path / "spots.csv").write_text("".join(f"{','.join(row)}\n" for row in [header, *bare]), encoding="utf-8")
+    run_ctreg(command, tmp_path / "spots.csv", "-m", FRAME, "-o", tmp_path / "p.csv")
+    found = read_results(tmp_path / "p.csv")
+    assert [(row.status, row.reason) for row in found] == [("no_pose", "no_scale"), ("ok", "")]
+    run_ctreg(command, tmp_path / "spots.csv", "-m", FRAME, "-q", "--strict", code=1)
+
+
+def test_a_spots_table_without_scale_names_itself_and_its_columns(bare_spots: Path) -> None:
+    assert_refused("pose", bare_spots, "-m", FRAME, say=f"{bare_spots}: columns s_x_mm, s_y_mm: no pixel scale")
+    result = run_ctreg("track", "-", "-m", FRAME, stdin=bare_spots.read_text(encoding="utf-8"), code=2)
+    assert "standard input: columns s_x_mm" in result.stderr
+
+
 def test_an_image_without_scale_is_the_same(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     Image.fromarray(rng.integers(0, 50, (64, 64), dtype=np.uint8)).save(tmp_path / "a.png")
@@ -104,6 +124,9 @@ def test_an_image_without_scale_is_the_same(tmp_path: Path) -> None:
         (["pose", "SPOTS", "-m", FRAME, "--scale", "0.5", "nan"], "s_y"),
         (["pose", "SPOTS", "-m", FRAME, "--scale", "0.5"], "--scale"),
         (["pose", "SPOTS", "-m", FRAME, "--spot-sd", "0"], "--spot-sd"),
+        (["pose", "SPOTS", "-m", FRAME, "--spot-sd", "1e300"], "--spot-sd"),
+        (["pose", "SPOTS", "", "-m", FRAME], "an input has no name"),
+        (["track", "SPOTS", "-m", FRAME, "-o", "t.csv", "--smooth", "-"], "--smooth -"),
         (["pose", "SPOTS", "-m", FRAME, "--alert-limit", "-1"], "--alert-limit"),
         (["pose", "SPOTS", "-m", FRAME, "--integrity-risk", "1"], "--integrity-risk"),
         (["pose", "SPOTS", "-m", FRAME, "--overlay", "pictures"], "no pixels"),

@@ -52,6 +52,26 @@ def test_joint_writes_one_pose_in_a_row_a_slice(scanned: tuple[Path, Path, Scan]
     assert [row.status for row in read_results(tmp_path / "p.csv")] == ["ok"] * 8
 
 
+def test_a_carried_pose_has_no_residual(scanned: tuple[Path, Path, Scan], tmp_path: Path) -> None:
+    """Nothing was measured in that slice: a residual of zero would be the best of all."""
+    document = json.loads(scanned[0].read_text(encoding="utf-8"))
+    beyond = document["slices"][-1]
+    T = np.array(beyond["T_patient_slice"])
+    T[:3, 3] += 200 * T[:3, 2]
+    beyond |= {"T_patient_slice": T.tolist(), "spots": []}
+    (tmp_path / "s.json").write_text(json.dumps(document), encoding="utf-8")
+    arguments = ("pose", tmp_path / "s.json", "-m", scanned[1], "--joint", "-v")
+    said = run_ctreg(*arguments, "-o", tmp_path / "p.json", "-o", tmp_path / "p.csv").stderr
+    assert "nan" not in said
+    row = read_results(tmp_path / "p.csv")[-1]
+    assert (row.status, row.cells["n_matched"], row.cells["rms_px"]) == ("ok", "0", "")
+    assert "carried" in row.cells["warnings"]
+    record = json.loads((tmp_path / "p.json").read_text(encoding="utf-8"))["results"][-1]
+    assert record["rms_px"] is None
+    assert record["candidates"][0]["rms_px"] is None
+    run_ctreg("report", tmp_path / "p.json", "-m", scanned[1], "-o", tmp_path / "r.html")
+
+
 def test_joint_without_places_is_refused_in_one_sentence(scanned: tuple[Path, Path, Scan], tmp_path: Path) -> None:
     spots, frame, _ = scanned
     table = tmp_path / "spots.csv"

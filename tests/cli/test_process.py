@@ -96,12 +96,16 @@ main()
 
 
 FULL = Path("/dev/full")
+FULL_NAMES = ("full.csv", "full.json", "full.jsonl", "full.tum")
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
-@pytest.mark.parametrize(("outputs", "place"), [([], "standard output"), (["-o", "full.jsonl"], "full.jsonl")])
+@pytest.mark.parametrize(
+    ("outputs", "place"), [([], "standard output"), *((["-o", name], name) for name in FULL_NAMES)]
+)
 def test_a_full_disk_is_named(two_slices: Path, tmp_path: Path, outputs: list[str], place: str) -> None:
-    (tmp_path / "full.jsonl").symlink_to(FULL)
+    for name in FULL_NAMES:
+        (tmp_path / name).symlink_to(FULL)
     with FULL.open("w") as full:
         done = subprocess.run(
             [*CTREG, "pose", two_slices, "-m", FRAME, *outputs, "-q"],
@@ -113,3 +117,11 @@ def test_a_full_disk_is_named(two_slices: Path, tmp_path: Path, outputs: list[st
         )
     assert done.returncode == 2
     assert done.stderr == f"ctreg: error: {place}: cannot be written (No space left on device)\n"
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="this system has no /dev/full")
+def test_help_that_cannot_be_said_is_no_traceback() -> None:
+    with FULL.open("w") as full:
+        done = subprocess.run([*CTREG, "--help"], stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 2
+    assert done.stderr == "ctreg: error: standard output: No space left on device\n"

@@ -124,6 +124,47 @@ def test_a_pose_comes_back_from_the_table(tmp_path: Path, results: list[FrameRes
             np.testing.assert_allclose(row.T_slice_model[:3, 3], T[:3, 3], atol=1e-6)
 
 
+@pytest.mark.parametrize("suffix", [".json", ".jsonl"])
+def test_rows_are_the_same_whichever_format_they_were_written_in(
+    tmp_path: Path, results: list[FrameResult], suffix: str
+) -> None:
+    for name in ("poses.csv", f"poses{suffix}"):
+        write_results(results, tmp_path / name, HEADER)
+    table, document = read_results(tmp_path / "poses.csv"), read_results(tmp_path / f"poses{suffix}")
+    for row, other in zip(table, document, strict=True):
+        for name in ("index", "source", "time_s", "status", "reason"):
+            assert getattr(row, name) == getattr(other, name)
+        assert (row.T_slice_model is None) == (other.T_slice_model is None)
+        if row.T_slice_model is not None and other.T_slice_model is not None:
+            np.testing.assert_allclose(row.T_slice_model, other.T_slice_model, atol=1e-6)
+        assert {name: other.cells[name] for name in row.cells} == row.cells
+
+
+def test_what_is_no_result_is_said_to_be_none(tmp_path: Path) -> None:
+    columns = "slice,status,tx_mm,ty_mm,tz_mm,qx,qy,qz,qw"
+    for content, wanted in {
+        "": "no column slice, status",
+        "slice,status\n0,ok\n": "no column tx_mm",
+        f"{columns}\nnan,no_pose,,,,,,,\n": ":2: slice: a number",
+        f"{columns}\n0,ok,inf,0,0,0,0,0,1\n": ":2: tx_mm, ty_mm, tz_mm: a number",
+        f"{columns}\n0,ok,0,0,0,0,0,0,0\n": ":2: qx, qy, qz, qw: a quaternion of length 1",
+    }.items():
+        (tmp_path / "p.csv").write_text(content, encoding="utf-8")
+        with pytest.raises(InputError, match=f"p.csv.*{wanted}.*ctreg pose or ctreg track"):
+            read_results(tmp_path / "p.csv")
+    (tmp_path / "p.csv").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="no UTF-8 text"):
+        read_results(tmp_path / "p.csv")
+    (tmp_path / "p.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(InputError, match="no list of results"):
+        read_results(tmp_path / "p.json")
+    with pytest.raises(InputError, match="name a file"):
+        write_results([], "-", HEADER)
+    with pytest.raises(InputError, match=r"header: None .*ResultsHeader\(model="):
+        write_results([], tmp_path / "q.json", None)  # type: ignore[arg-type]
+    assert not list(tmp_path.glob("*q*"))
+
+
 def test_standard_deviations_are_roots_of_the_covariance_diagonal(tmp_path: Path, results: list[FrameResult]) -> None:
     write_results(results, tmp_path / "poses.csv", HEADER)
     cells = read_results(tmp_path / "poses.csv")[0].cells

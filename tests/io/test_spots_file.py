@@ -203,6 +203,9 @@ def test_tables_as_other_programs_write_them(text: str) -> None:
     assert np.isnan(spot_slice.spots.area_px[0])
 
 
+PLACED = "slice,u_px,v_px,image_position_mm,image_orientation\n"
+
+
 def test_spots_left_out_are_numbered_anew_and_it_is_said() -> None:
     slices, warnings = parse_spots(b"slice,spot,u_px,v_px\n0,4,40,4\n0,2,20,2\n1,0,1,1\n", "t.csv")
     assert slices[0].spots.uv_px[:, 0].tolist() == [20, 40]
@@ -230,10 +233,14 @@ def test_spots_left_out_are_numbered_anew_and_it_is_said() -> None:
         ("slice,u_px,v_px\n1.5,1,2\n", r"t:2: slice: .*integer"),
         ("slice,u_px,v_px\n,1,2\n", r"t:2: slice: .*integer"),
         ("slice,u_px,v_px,sd_u_px,sd_v_px\n0,1,2,0,1\n", r"t:2: sd_u_px: .*greater"),
-        ("slice,u_px,v_px,sd_u_px,sd_v_px\n0,1,2,1,\n", r"t:2: .*give both or neither"),
-        ("slice,u_px,v_px,sd_u_px,sd_v_px,cov_uv_px2\n0,1,2,1,1,2\n", r"t:2: .*positive definite"),
+        ("slice,u_px,v_px,sd_u_px,sd_v_px\n0,1,2,1,\n", r"t:2: sd_u_px, sd_v_px: give both or neither"),
+        ("slice,u_px,v_px,sd_u_px,sd_v_px,cov_uv_px2\n0,1,2,1,1,2\n", r"t:2: covariance: .*positive definite"),
+        (f"{PLACED}0,1,2,1\\2,1\\0\\0\\0\\1\\0\n", r"t:2: image_position_mm: .*required"),
+        (f"{PLACED}0,1,2,1\\x\\3,1\\0\\0\\0\\1\\0\n", r"t:2: image_position_mm: .*number.*'x'"),
+        (f"{PLACED}0,1,2,1\\2\\3,1\\0\\0\\1\\1\\0\n", r"t:2: image_orientation: .*orthogonal"),
         ("slice,u_px,v_px,s_x_mm\n0,1,2,0.5\n", r"t:2: .*s_x_mm, s_y_mm"),
-        ("slice,u_px,v_px,s_x_mm,s_y_mm\n0,1,2,-1,1\n", r"t:2: s_x_mm: .*greater than 0"),
+        ("slice,u_px,v_px,s_x_mm,s_y_mm\n0,1,2,-1,1\n", r"t:2: s_x_mm: .*greater than or equal to 0.000001"),
+        ("slice,u_px,v_px,s_x_mm,s_y_mm\n0,1,2,1,1e300\n", r"t:2: s_y_mm: .*less than or equal to 1000"),
         ("slice,u_px,v_px,source\n0,1,2,a\n0,1,2,b\n", r"t:3: source: differs from line 2"),
         ("slice,spot,u_px,v_px\n0,1,1,2\n0,1,3,4\n", r"t:2: spot: .*twice"),
         ('slice,u_px,v_px\n0,"1,2\n', r"t:2: .*quote"),

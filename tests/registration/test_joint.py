@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -110,6 +111,7 @@ def test_a_slice_without_its_rods_denies_the_pose_and_one_beyond_the_rods_does_n
     assert [row.status for row in joint.slices] == ["ok", "no_pose", "ok", "ok"]
     assert joint.slices[1].reason == "inconsistent"
     assert dict(joint.slices[3].warnings).keys() >= {"carried"}
+    assert [math.isnan(joint.slices[place].candidates[0].rms_px) for place in (0, 2, 3)] == [False, False, True]
 
 
 def test_slices_too_poor_to_register_alone_still_count() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ctreg_cli.geometry.projection import project
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.servo import Desired, ServoOptions, pseudoinverse, servo, stability_margin, view
 from tests.oracle import OracleFrame, bound, cross_line, random_frame
@@ -222,6 +223,20 @@ def test_units_do_not_move_the_margin(cube: tuple[RodModel, OracleFrame]) -> Non
         here, there = view(desired, scaled), view(desired, far)
         margins.append(stability_margin(pseudoinverse(here.jacobian, here), there.jacobian, m.size_mm))
     assert margins[0] == pytest.approx(margins[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("left_over_sd", [0.0, 0.03], ids=["looks again", "looks no more"])
+def test_lambda_is_that_of_the_pose_it_comes_with(cube: tuple[RodModel, OracleFrame], left_over_sd: float) -> None:
+    model, frame = cube
+    options = ServoOptions(left_over_sd=left_over_sd, spot_tolerance_sd=3e-3)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        T, rods = tilted_pose(frame, rng), np.arange(len(model))
+        start = moved(T, np.array([1.5, -1.0, 2.0]), np.array([0.02, -0.03, 0.01]), model)
+        out = servo(model, start, desired_at(model, T, rods, rng.normal(size=(len(rods), 2)) * 0.3), options=options)
+        assert out.converged
+        expected = project(out.T, model.starts, model.directions).lambda_mm
+        np.testing.assert_allclose(out.view.crossing.lambda_mm, expected, atol=1e-9)
 
 
 def test_spots_that_do_not_determine_the_pose_are_said_to(cube: tuple[RodModel, OracleFrame]) -> None:

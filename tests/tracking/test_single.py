@@ -22,6 +22,7 @@ def test_crossings_and_motion_field(seed: int) -> None:
     crossing, projection = single.cross(T, single.model_lines(model)), project(T, model.starts, model.directions)
     np.testing.assert_allclose(crossing.xy_mm, projection.xy_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.lambda_mm, projection.lambda_mm, rtol=1e-12)
+    np.testing.assert_allclose(single.lambdas(T, single.model_lines(model)), projection.lambda_mm, rtol=1e-12)
     np.testing.assert_allclose(crossing.slope, projection.slope, rtol=1e-12)
     np.testing.assert_allclose(crossing.mm_per_height, np.hypot(1.0, np.hypot(*projection.slope.T)), rtol=1e-12)
     np.testing.assert_allclose(crossing.jacobian, motion_field(T, projection), rtol=1e-12, atol=1e-12)
