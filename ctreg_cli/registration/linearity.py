@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.evidence import PosePrior
-from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
+from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 
 #: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is
@@ -33,6 +33,11 @@ _POINTS = 8
 _BEYOND_END = 0.02
 #: rise where a rod no longer crosses the slice, and ln of the room beyond which Laplace's method is not believed
 _NO_WAY, _MOST_ROOM = 9.0, 30.0
+#: how far the valley is walked outward, in the steps the covariance says it takes; if it has not ended by then, it has
+#: no end
+_OUTWARD = (1.0, 1.35, 1.8, 2.4, 3.2, 4.2)
+#: a valley that rises at the first of them by this share of what it should (in sd) foretells where it ends
+_AS_FORETOLD = 0.85
 
 
 class Valley(NamedTuple):
@@ -105,6 +110,86 @@ def covariance_along_the_valley(
     return Valley(covariance + inflation**2 * positive_part(spread), float(factors[ends].max()), wrong_p)
 
 
+def length_of_the_valley(
+    model: RodModel,
+    T: FloatArray,
+    covariance: FloatArray,
+    seen: Observations,
+    sds: float,
+    *,
+    prior: PosePrior | None = None,
+) -> FloatArray:
+    """How many times longer the valley of each cost is than its covariance says, where it has risen by ``sds²``.
+
+    Args:
+        model: the rods.
+        T: (b, 4, 4) minima of the costs.
+        covariance: (b, 6, 6) what the curvature there says, mm and rad.
+        seen: the spots that each rests on.
+        sds: standard deviations that the covariance is asked to be true for.
+        prior: rotations outside its cone do not count.
+
+    Returns:
+        Factors (b,), at least 1, infinite where no end was found.
+    """
+    b = len(T)
+    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
+    values, vectors = np.linalg.eigh(covariance * (unit[:, None] * unit))
+    axes = np.repeat(vectors / unit[:, None], 2, axis=0)
+    step = (
+        axes[..., -1] * (np.repeat(np.sqrt(np.maximum(values[:, -1], 0)), 2) * sds * np.tile([1.0, -1.0], b))[:, None]
+    )
+    basis = axes[..., :-1]
+    both = seen.subset(np.repeat(np.arange(b), 2))
+    moved = np.repeat(T, 2, axis=0)
+    least = np.repeat(linearise(model, T, seen).chi2, 2)
+    risen, ends = np.zeros(2 * b), np.full(2 * b, np.inf)
+    active, before = np.arange(2 * b), 0.0
+    for far in _OUTWARD:
+        part = both.subset(active)
+        there = poses.update(moved[active], (far - before) * step[active])
+        there = _give_way(model, there, part, basis[active], 3)
+        fit = linearise(model, there, part)
+        moved[active] = there
+        now = np.sqrt(np.maximum(np.where(np.isfinite(fit.chi2), fit.chi2 - least[active], np.inf), 0))
+        barred = ~_may_be_cut(model, fit, part)
+        if prior is not None:
+            barred |= ~prior.allows(there[:, :3, :3])
+        now[barred] = np.inf
+        over = now >= sds
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(np.isfinite(now), (sds - risen[active]) / (now - risen[active]), 1.0)
+            ends[active[over]] = (before + (far - before) * share)[over]
+            if before == 0.0:
+                foretold = ~over & (now > _AS_FORETOLD * sds)
+                ends[active[foretold]] = sds / now[foretold]
+                over |= foretold
+        risen[active] = now
+        active, before = active[~over], far
+        if len(active) == 0:
+            break
+    result: FloatArray = np.maximum(ends.reshape(b, 2).max(axis=1), 1.0)
+    return result
+
+
+def _give_way(model: RodModel, T: FloatArray, seen: Observations, basis: FloatArray, steps: int) -> FloatArray:
+    """Minimise the costs over the directions ``basis`` ((b,) 6, 5) only."""
+    across = np.swapaxes(basis, -1, -2)
+    for _ in range(steps):
+        H, g = linearise(model, T, seen).normal_equations()
+        Hc = across @ H @ basis
+        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
+        T = poses.update(T, (basis @ np.linalg.solve(Hc, across @ g[..., None]))[..., 0])
+    return T
+
+
+def _may_be_cut(model: RodModel, fit: Linearisation, seen: Observations) -> BoolArray:
+    """(b,) whether the slice cuts all matched rods, or nearly."""
+    beyond = np.maximum(-fit.lambda_mm, fit.lambda_mm - model.lengths) - seen.half_slab_mm
+    cut = (beyond < _BEYOND_END * model.size_mm) | ~seen.matched
+    return np.asarray(cut.all(axis=1))
+
+
 def positive_part(M: FloatArray) -> FloatArray:
     """A symmetric matrix without its negative eigenvalues."""
     values, vectors = np.linalg.eigh(M)
@@ -165,11 +250,7 @@ def _profile(
     here = linearise(model, T[None], seen)
     moved = poses.update(np.repeat(T[None], b, axis=0), steps[:, None] * axes[:, -1])
     basis = axes[:, :-1]
-    for _ in range(5):
-        H, g = linearise(model, moved, repeated).normal_equations()
-        Hc = basis.T @ H @ basis
-        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
-        moved = poses.update(moved, np.linalg.solve(Hc, (g @ basis)[..., None])[..., 0] @ basis.T)
+    moved = _give_way(model, moved, repeated, basis, 5)
     there = linearise(model, moved, repeated)
     H, H_here = there.normal_equations()[0], here.normal_equations()[0]
     offset = poses.difference(moved, T)
@@ -181,9 +262,7 @@ def _profile(
     room = 0.5 * (np.linalg.slogdet(basis.T @ H_here @ basis)[1] - np.linalg.slogdet(basis.T @ H @ basis)[1])
     if prior is not None:
         room += prior.log_density(moved[:, :3, :3]) - prior.log_density(T[None, :3, :3])
-    beyond = np.maximum(-there.lambda_mm, there.lambda_mm - model.lengths) - seen.half_slab_mm
-    cut = (beyond < _BEYOND_END * model.size_mm) | ~seen.matched
-    room = np.where(cut.all(axis=1), room, -_MOST_ROOM)
+    room = np.where(_may_be_cut(model, there, repeated), room, -_MOST_ROOM)
     return _Profile(
         step=steps,
         rise=np.where(np.isfinite(rise), rise, _NO_WAY),
