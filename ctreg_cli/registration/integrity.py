@@ -81,8 +81,8 @@ def protection_levels(
     arms = points @ np.swapaxes(T_all[:, :3, :3], 1, 2)  # (b, p, 3)
     place = arms + T_all[:, None, :3, 3]
     separation = np.linalg.norm(place - place[0], axis=-1)
-    longer = length_of_the_valley(model, T_all, C, seen_all, quantile * inflation, prior=prior)
-    noise = quantile * inflation * longer[:, None] * _largest_sd(C, arms)
+    longer = length_of_the_valley(model, T_all, C, seen_all, points, quantile * inflation, prior=prior)
+    noise = quantile * inflation * longer * _largest_sd(C, arms)
     level = np.concatenate([separation + noise, quantile * _largest_sd(covariance[None], arms[:1])]).max(axis=0)
     result: FloatArray = np.where(level < _UNKNOWN * model.size_mm, level, np.inf)
     return result

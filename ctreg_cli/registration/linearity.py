@@ -15,6 +15,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
@@ -115,60 +116,70 @@ def length_of_the_valley(
     T: FloatArray,
     covariance: FloatArray,
     seen: Observations,
+    points: FloatArray,
     sds: float,
     *,
     prior: PosePrior | None = None,
 ) -> FloatArray:
-    """How many times longer the valley of each cost is than its covariance says, where it has risen by ``sds²``.
+    """How many times farther points may be than the covariance says, where the cost has risen by ``sds²``.
 
     Args:
         model: the rods.
         T: (b, 4, 4) minima of the costs.
         covariance: (b, 6, 6) what the curvature there says, mm and rad.
         seen: the spots that each rests on.
+        points: (p, 3) in the model, mm; each is moved the way it is known least.
         sds: standard deviations that the covariance is asked to be true for.
         prior: rotations outside its cone do not count.
 
     Returns:
-        Factors (b,), at least 1, infinite where no end was found.
+        Factors (b, p), at least 1, infinite where no end was found.
     """
-    b = len(T)
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
-    values, vectors = np.linalg.eigh(covariance * (unit[:, None] * unit))
-    axes = np.repeat(vectors / unit[:, None], 2, axis=0)
-    step = (
-        axes[..., -1] * (np.repeat(np.sqrt(np.maximum(values[:, -1], 0)), 2) * sds * np.tile([1.0, -1.0], b))[:, None]
-    )
-    basis = axes[..., :-1]
-    both = seen.subset(np.repeat(np.arange(b), 2))
-    moved = np.repeat(T, 2, axis=0)
-    least = np.repeat(linearise(model, T, seen).chi2, 2)
-    risen, ends = np.zeros(2 * b), np.full(2 * b, np.inf)
-    active, before = np.arange(2 * b), 0.0
+    b, p = len(T), len(points)
+    unit = np.array([1, 1, 1, *(3 * [1 / model.size_mm])])
+    arms = points @ np.swapaxes(T[:, :3, :3], 1, 2)
+    G = np.concatenate([np.broadcast_to(np.eye(3), (b, p, 3, 3)), -skew(arms)], axis=-1)
+    values, vectors = np.linalg.eigh(G @ covariance[:, None] @ np.swapaxes(G, -1, -2))
+    moves = (vectors[..., None, :, -1] @ G)[..., 0, :]  # (b, p, 6): by how much a twist moves the point that way
+    sd = np.sqrt(np.maximum(values[..., -1:], 1e-300))
+    step = np.repeat(((covariance[:, None] @ moves[..., None])[..., 0] * (sds / sd)).reshape(b * p, 6), 2, axis=0)
+    step[1::2] *= -1
+    across = np.linalg.qr((moves * unit).reshape(b * p, 6, 1), mode="complete")[0][..., 1:] * unit[:, None]
+    basis = np.repeat(across, 2, axis=0)
+    both = seen.subset(np.repeat(np.arange(b), 2 * p))
+    moved = np.repeat(T, 2 * p, axis=0)
+    least = np.repeat(linearise(model, T, seen).chi2, 2 * p)
+    point = np.tile(np.repeat(points, 2, axis=0), (b, 1))
+    place = np.repeat((arms + T[:, None, :3, 3]).reshape(b * p, 3), 2, axis=0)
+    foretold = np.repeat(sds * sd.reshape(b * p), 2)
+    risen, gone, ends = np.zeros(2 * b * p), np.zeros(2 * b * p), np.full(2 * b * p, np.inf)
+    active, before = np.arange(2 * b * p), 0.0
     for far in _OUTWARD:
         part = both.subset(active)
         there = poses.update(moved[active], (far - before) * step[active])
         there = _give_way(model, there, part, basis[active], 3)
         fit = linearise(model, there, part)
-        moved[active] = there
         now = np.sqrt(np.maximum(np.where(np.isfinite(fit.chi2), fit.chi2 - least[active], np.inf), 0))
         barred = ~_may_be_cut(model, fit, part)
         if prior is not None:
             barred |= ~prior.allows(there[:, :3, :3])
         now[barred] = np.inf
+        # the valley may bend: how far the point is, not how far along
+        here = (there[:, :3, :3] @ point[active][..., None])[..., 0] + there[:, :3, 3]
+        distance = np.linalg.norm(here - place[active], axis=1) / foretold[active]
         over = now >= sds
         with np.errstate(invalid="ignore", divide="ignore"):
             share = np.where(np.isfinite(now), (sds - risen[active]) / (now - risen[active]), 1.0)
-            ends[active[over]] = (before + (far - before) * share)[over]
+            end = gone[active] + share * (distance - gone[active])
             if before == 0.0:
-                foretold = ~over & (now > _AS_FORETOLD * sds)
-                ends[active[foretold]] = sds / now[foretold]
-                over |= foretold
-        risen[active] = now
+                end = np.where(over, end, distance * sds / now)
+                over |= now > _AS_FORETOLD * sds
+        ends[active[over]] = end[over]
+        moved[active], risen[active], gone[active] = there, now, distance
         active, before = active[~over], far
         if len(active) == 0:
             break
-    result: FloatArray = np.maximum(ends.reshape(b, 2).max(axis=1), 1.0)
+    result: FloatArray = np.maximum(ends.reshape(b, p, 2).max(axis=2), 1.0)
     return result
 
 
