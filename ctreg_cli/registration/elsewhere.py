@@ -92,8 +92,8 @@ def solutions_without_a_spot(
         )
         kept = elsewhere(T_on, left_out, fit.chi2)
         T_on, left_out = T_on[kept], left_out[kept]
-    if len(T_on) == 0:
-        return T_known, without
+        if len(T_on) == 0:
+            return T_known, without
     # the known ones too: what the others' odds are measured by
     found = weigh(
         model, scene, np.concatenate([T_known, T_on]), np.concatenate([without, without[left_out]]), least_matches=3
@@ -125,7 +125,9 @@ def _steps_without(model: RodModel, fit: Linearisation, matched: IntArray) -> tu
     J, W, r = fit.jacobian[:, matched] * unit, fit.weight[:, matched], fit.residual_px[:, matched]
     JW = np.swapaxes(J, -1, -2) @ W  # (b, k, 6, 2)
     H, g, chi2 = JW @ J, (JW @ r[..., None])[..., 0], ((W @ r[..., None])[..., 0] * r).sum(axis=-1)
-    H, g, chi2 = (x.sum(axis=1, keepdims=True) - x for x in (H, g, chi2))
+    b, k = chi2.shape
+    others = 1 - np.eye(k)  # not the sum of all less its own: rods nearly in the slice have Jacobians beyond all bounds
+    H, g, chi2 = (others @ H.reshape(b, k, 36)).reshape(H.shape), others @ g, chi2 @ others
     diagonal = np.einsum("bkii->bki", H)
     diagonal += 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-300
     step = np.linalg.solve(H, g[..., None])[..., 0]

@@ -39,6 +39,9 @@ _NO_WAY, _MOST_ROOM = 9.0, 30.0
 _OUTWARD = (1.0, 1.35, 1.8, 2.4, 3.2, 4.2)
 #: a valley that rises at the first of them by this share of what it should (in sd) foretells where it ends
 _AS_FORETOLD = 0.85
+#: ... and by this share it is straight: the probability beyond K sd grows fivefold at most, and a protection level
+#: shares its risk between more faults than that, of which one at most is there
+_AS_SAID = 0.95
 
 
 class Valley(NamedTuple):
@@ -173,6 +176,7 @@ def length_of_the_valley(
             end = gone[active] + share * (distance - gone[active])
             if before == 0.0:
                 end = np.where(over, end, distance * sds / now)
+                end[(now > _AS_SAID * sds) & (end < 1 / _AS_SAID)] = 1.0
                 over |= now > _AS_FORETOLD * sds
         ends[active[over]] = end[over]
         moved[active], risen[active], gone[active] = there, now, distance
