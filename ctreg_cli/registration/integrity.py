@@ -15,13 +15,18 @@ infinite.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry.plucker import skew
-from ctreg_cli.registration.refine import Observations, covariance_from_information, refine
+from ctreg_cli.registration.evidence import PosePrior
+from ctreg_cli.registration.linearity import length_of_the_valley
+from ctreg_cli.registration.matching import distinct_poses
+from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 
 #: matches below which leaving one out leaves nothing to check it by
@@ -37,8 +42,21 @@ def protected_points(model: RodModel) -> FloatArray:
     return np.array([target.point for target in model.targets])
 
 
+def risk_of_each(risk: float, n_matches: int) -> float:
+    """The share of the risk that each possible fault, and none, may use up: in noise, and in solutions neglected."""
+    return risk / (n_matches + 1)
+
+
 def protection_levels(
-    model: RodModel, T: FloatArray, covariance: FloatArray, seen: Observations, risk: float, *, inflation: float = 1.0
+    model: RodModel,
+    T: FloatArray,
+    covariance: FloatArray,
+    seen: Observations,
+    solutions: Sequence[tuple[FloatArray, Observations]],
+    risk: float,
+    *,
+    inflation: float = 1.0,
+    prior: PosePrior | None = None,
 ) -> FloatArray:
     """Protection level (p,) in mm at each of :func:`protected_points`.
 
@@ -47,36 +65,44 @@ def protection_levels(
         T: (4, 4) the pose to protect.
         covariance: (6, 6) its covariance.
         seen: one hypothesis: the spots it rests on.
+        solutions: what may be sound in its place: poses (b, 4, 4) and the spots they rest on. Those without each of
+            the spots that the pose rests on have to be among them.
         risk: accepted probability, a slice, that the error exceeds the level.
-        inflation: factor on the standard deviations of the leave-one-out solutions, as for the full one.
+        inflation: factor on the standard deviations of the solutions, as for the full one.
+        prior: rotations it does not allow need not be protected from.
     """
     points = protected_points(model)
-    matched = np.nonzero(seen.matched[0])[0]
-    n = len(matched)
+    n = int(seen.matched.sum())
     if n < LEAST_MATCHES:
         return np.full(len(points), np.inf)
-    quantile = math.sqrt(float(chdtri(3, risk / (n + 1))))
-    without = np.repeat(seen.matched, n, axis=0)
-    without[np.arange(n), matched] = False
-    subsets = Observations(
-        uv_px=np.repeat(seen.uv_px, n, axis=0),
-        covariance_px=np.repeat(seen.covariance_px, n, axis=0),
-        matched=without,
-        mm_per_px=seen.mm_per_px,
-        half_slab_mm=seen.half_slab_mm,
-        resolved_mm=seen.resolved_mm,
-    )
-    T_without, fit, _ = refine(model, np.repeat(T[None], n, axis=0), subsets, iterations=6, step_tolerance=1e-6)
-    H, _ = fit.normal_equations()
-    C, _ = covariance_from_information(H, model.size_mm)
-    place = points @ T[:3, :3].T + T[:3, 3]
-    place_without = points @ np.swapaxes(T_without[:, :3, :3], 1, 2) + T_without[:, None, :3, 3]
-    separation = np.linalg.norm(place_without - place, axis=-1)  # (n, p)
-    sd_without = inflation * _largest_sd(C, points @ np.swapaxes(T_without[:, :3, :3], 1, 2))
-    sd = _largest_sd(covariance[None], (points @ T[:3, :3].T)[None])
-    level = np.concatenate([separation + quantile * sd_without, quantile * sd]).max(axis=0)
+    quantile = math.sqrt(float(chdtri(3, risk_of_each(risk, n))))
+    T_all, seen_all = _one_of_each(model, [(T[None], seen), *solutions])
+    C, _ = covariance_from_information(linearise(model, T_all, seen_all).normal_equations()[0], model.size_mm)
+    arms = points @ np.swapaxes(T_all[:, :3, :3], 1, 2)  # (b, p, 3)
+    place = arms + T_all[:, None, :3, 3]
+    separation = np.linalg.norm(place - place[0], axis=-1)
+    longer = length_of_the_valley(model, T_all, C, seen_all, points, quantile * inflation, prior=prior)
+    noise = quantile * inflation * longer * _largest_sd(C, arms)
+    level = np.concatenate([separation + noise, quantile * _largest_sd(covariance[None], arms[:1])]).max(axis=0)
     result: FloatArray = np.where(level < _UNKNOWN * model.size_mm, level, np.inf)
     return result
+
+
+def _one_of_each(
+    model: RodModel, solutions: Sequence[tuple[FloatArray, Observations]]
+) -> tuple[FloatArray, Observations]:
+    """Solutions (b, 4, 4) with what they rest on: of the same rods and nearly the same pose only the first."""
+    T = np.concatenate([T for T, _ in solutions])
+    parts = [part for _, part in solutions]
+    together = replace(
+        parts[0],
+        uv_px=np.concatenate([part.uv_px for part in parts]),
+        covariance_px=np.concatenate([part.covariance_px for part in parts]),
+        matched=np.concatenate([part.matched for part in parts]),
+    )
+    rods = np.unique(together.matched, axis=0, return_inverse=True)[1].reshape(-1)
+    kept = distinct_poses(model, T, rods)
+    return T[kept], together.subset(kept)
 
 
 def _largest_sd(C: FloatArray, arms: FloatArray) -> FloatArray:

@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
+from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.registration.evidence import PosePrior
-from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise
+from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
 from ctreg_cli.rods import RodModel
 
 #: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is
@@ -33,6 +34,14 @@ _POINTS = 8
 _BEYOND_END = 0.02
 #: rise where a rod no longer crosses the slice, and ln of the room beyond which Laplace's method is not believed
 _NO_WAY, _MOST_ROOM = 9.0, 30.0
+#: how far the valley is walked outward, in the steps the covariance says it takes; if it has not ended by then, it has
+#: no end
+_OUTWARD = (1.0, 1.35, 1.8, 2.4, 3.2, 4.2)
+#: a valley that rises at the first of them by this share of what it should (in sd) foretells where it ends
+_AS_FORETOLD = 0.85
+#: ... and by this share it is straight: the probability beyond K sd grows fivefold at most, and a protection level
+#: shares its risk between more faults than that, of which one at most is there
+_AS_SAID = 0.95
 
 
 class Valley(NamedTuple):
@@ -105,6 +114,97 @@ def covariance_along_the_valley(
     return Valley(covariance + inflation**2 * positive_part(spread), float(factors[ends].max()), wrong_p)
 
 
+def length_of_the_valley(
+    model: RodModel,
+    T: FloatArray,
+    covariance: FloatArray,
+    seen: Observations,
+    points: FloatArray,
+    sds: float,
+    *,
+    prior: PosePrior | None = None,
+) -> FloatArray:
+    """How many times farther points may be than the covariance says, where the cost has risen by ``sds²``.
+
+    Args:
+        model: the rods.
+        T: (b, 4, 4) minima of the costs.
+        covariance: (b, 6, 6) what the curvature there says, mm and rad.
+        seen: the spots that each rests on.
+        points: (p, 3) in the model, mm; each is moved the way it is known least.
+        sds: standard deviations that the covariance is asked to be true for.
+        prior: rotations outside its cone do not count.
+
+    Returns:
+        Factors (b, p), at least 1, infinite where no end was found.
+    """
+    b, p = len(T), len(points)
+    unit = np.array([1, 1, 1, *(3 * [1 / model.size_mm])])
+    arms = points @ np.swapaxes(T[:, :3, :3], 1, 2)
+    G = np.concatenate([np.broadcast_to(np.eye(3), (b, p, 3, 3)), -skew(arms)], axis=-1)
+    values, vectors = np.linalg.eigh(G @ covariance[:, None] @ np.swapaxes(G, -1, -2))
+    moves = (vectors[..., None, :, -1] @ G)[..., 0, :]  # (b, p, 6): by how much a twist moves the point that way
+    sd = np.sqrt(np.maximum(values[..., -1:], 1e-300))
+    step = np.repeat(((covariance[:, None] @ moves[..., None])[..., 0] * (sds / sd)).reshape(b * p, 6), 2, axis=0)
+    step[1::2] *= -1
+    across = np.linalg.qr((moves * unit).reshape(b * p, 6, 1), mode="complete")[0][..., 1:] * unit[:, None]
+    basis = np.repeat(across, 2, axis=0)
+    both = seen.subset(np.repeat(np.arange(b), 2 * p))
+    moved = np.repeat(T, 2 * p, axis=0)
+    least = np.repeat(linearise(model, T, seen).chi2, 2 * p)
+    point = np.tile(np.repeat(points, 2, axis=0), (b, 1))
+    place = np.repeat((arms + T[:, None, :3, 3]).reshape(b * p, 3), 2, axis=0)
+    foretold = np.repeat(sds * sd.reshape(b * p), 2)
+    risen, gone, ends = np.zeros(2 * b * p), np.zeros(2 * b * p), np.full(2 * b * p, np.inf)
+    active, before = np.arange(2 * b * p), 0.0
+    for far in _OUTWARD:
+        part = both.subset(active)
+        there = poses.update(moved[active], (far - before) * step[active])
+        there = _give_way(model, there, part, basis[active], 3)
+        fit = linearise(model, there, part)
+        now = np.sqrt(np.maximum(np.where(np.isfinite(fit.chi2), fit.chi2 - least[active], np.inf), 0))
+        barred = ~_may_be_cut(model, fit, part)
+        if prior is not None:
+            barred |= ~prior.allows(there[:, :3, :3])
+        now[barred] = np.inf
+        # the valley may bend: how far the point is, not how far along
+        here = (there[:, :3, :3] @ point[active][..., None])[..., 0] + there[:, :3, 3]
+        distance = np.linalg.norm(here - place[active], axis=1) / foretold[active]
+        over = now >= sds
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(np.isfinite(now), (sds - risen[active]) / (now - risen[active]), 1.0)
+            end = gone[active] + share * (distance - gone[active])
+            if before == 0.0:
+                end = np.where(over, end, distance * sds / now)
+                end[(now > _AS_SAID * sds) & (end < 1 / _AS_SAID)] = 1.0
+                over |= now > _AS_FORETOLD * sds
+        ends[active[over]] = end[over]
+        moved[active], risen[active], gone[active] = there, now, distance
+        active, before = active[~over], far
+        if len(active) == 0:
+            break
+    result: FloatArray = np.maximum(ends.reshape(b, p, 2).max(axis=2), 1.0)
+    return result
+
+
+def _give_way(model: RodModel, T: FloatArray, seen: Observations, basis: FloatArray, steps: int) -> FloatArray:
+    """Minimise the costs over the directions ``basis`` ((b,) 6, 5) only."""
+    across = np.swapaxes(basis, -1, -2)
+    for _ in range(steps):
+        H, g = linearise(model, T, seen).normal_equations()
+        Hc = across @ H @ basis
+        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
+        T = poses.update(T, (basis @ np.linalg.solve(Hc, across @ g[..., None]))[..., 0])
+    return T
+
+
+def _may_be_cut(model: RodModel, fit: Linearisation, seen: Observations) -> BoolArray:
+    """(b,) whether the slice cuts all matched rods, or nearly."""
+    beyond = np.maximum(-fit.lambda_mm, fit.lambda_mm - model.lengths) - seen.half_slab_mm
+    cut = (beyond < _BEYOND_END * model.size_mm) | ~seen.matched
+    return np.asarray(cut.all(axis=1))
+
+
 def positive_part(M: FloatArray) -> FloatArray:
     """A symmetric matrix without its negative eigenvalues."""
     values, vectors = np.linalg.eigh(M)
@@ -165,11 +265,7 @@ def _profile(
     here = linearise(model, T[None], seen)
     moved = poses.update(np.repeat(T[None], b, axis=0), steps[:, None] * axes[:, -1])
     basis = axes[:, :-1]
-    for _ in range(5):
-        H, g = linearise(model, moved, repeated).normal_equations()
-        Hc = basis.T @ H @ basis
-        Hc += 1e-12 * np.eye(5) * np.trace(Hc, axis1=1, axis2=2)[:, None, None]
-        moved = poses.update(moved, np.linalg.solve(Hc, (g @ basis)[..., None])[..., 0] @ basis.T)
+    moved = _give_way(model, moved, repeated, basis, 5)
     there = linearise(model, moved, repeated)
     H, H_here = there.normal_equations()[0], here.normal_equations()[0]
     offset = poses.difference(moved, T)
@@ -181,9 +277,7 @@ def _profile(
     room = 0.5 * (np.linalg.slogdet(basis.T @ H_here @ basis)[1] - np.linalg.slogdet(basis.T @ H @ basis)[1])
     if prior is not None:
         room += prior.log_density(moved[:, :3, :3]) - prior.log_density(T[None, :3, :3])
-    beyond = np.maximum(-there.lambda_mm, there.lambda_mm - model.lengths) - seen.half_slab_mm
-    cut = (beyond < _BEYOND_END * model.size_mm) | ~seen.matched
-    room = np.where(cut.all(axis=1), room, -_MOST_ROOM)
+    room = np.where(_may_be_cut(model, there, repeated), room, -_MOST_ROOM)
     return _Profile(
         step=steps,
         rise=np.where(np.isfinite(rise), rise, _NO_WAY),

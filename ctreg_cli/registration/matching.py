@@ -354,7 +354,7 @@ def _search_triples(
     ``seen`` collects the match sets already weighed; the ``most`` promising ones are.
     """
     layout = plan(model)
-    noise = _noise_mm(model, scene)
+    noise = noise_mm(model, scene)
     kept: list[tuple[FloatArray, FloatArray, IntArray]] = []
     for triple, spots in _spot_triples(scene.xy_mm[start_from], layout, rods, 4 * noise):
         spots = start_from[spots]
@@ -412,7 +412,7 @@ def _repair(model: RodModel, scene: Scene, T: FloatArray, spot_of_rod: IntArray,
     return verify(model, scene, T_without[best], without[best], least_matches)
 
 
-def _noise_mm(model: RodModel, scene: Scene) -> float:
+def noise_mm(model: RodModel, scene: Scene) -> float:
     """A generous standard deviation of a spot about its rod, mm."""
     variance = np.sort(scene.covariance_mm[:, 0, 0] + scene.covariance_mm[:, 1, 1]) / 2
     spot = math.sqrt(variance[int(0.8 * (len(variance) - 1))])
@@ -546,7 +546,7 @@ def visibility(
     known (``sd_mm`` along the rod); and rods outside the image. A rod that lies nearly in the slice would be cut
     anywhere with a little noise: it leaves a line, not a spot that says where, and half its length is the most.
     """
-    noise = _noise_mm(model, scene)
+    noise = noise_mm(model, scene)
     with np.errstate(invalid="ignore"):
         per_mm = np.sqrt(1 + (slope**2).sum(axis=-1))  # mm of rod per mm of slab
         near_end = np.minimum(scene.half_slab_mm * per_mm + 4 * noise * per_mm, MOST_BEYOND_END * model.lengths)
@@ -780,7 +780,7 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     most = _RESTARTS if len(matched) < _MANY_MATCHES else _RESTARTS // 2
     if len(triples) > most:  # many matches: twins are rare, and each of them shows in most triples
         triples = triples[:: len(triples) // most + 1]
-    noise = _noise_mm(model, scene)
+    noise = noise_mm(model, scene)
     T, _ = solve_three(
         RodTriples.of(model, triples),
         scene.xy_mm[spot_of_rod[triples]],
@@ -796,7 +796,7 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     for kept, iterations in ((_MOST_STARTS, 2), (_MOST_STARTS, 6), (_MOST_MINIMA, 16)):
         T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
         order = np.argsort(fit.chi2, kind="stable")
-        order = order[_distinct_poses(model, T[order])[:kept]]
+        order = order[distinct_poses(model, T[order])[:kept]]
         T, fit = T[order], fit.subset(order)
     # what speaks for another minimum is often a spot that the first one could not use: all vote again
     same, again = same[: len(T)], assign(model, scene, T, fit)
@@ -804,12 +804,16 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     return weigh(model, scene, np.concatenate([T, T[other]]), np.concatenate([same, again[other]]), least_matches)
 
 
-def _distinct_poses(model: RodModel, T: FloatArray) -> IntArray:
-    """Indices of poses (b, 4, 4) that differ by half a degree or a fiftieth of the frame, first come first."""
+def distinct_poses(model: RodModel, T: FloatArray, group: IntArray | None = None) -> IntArray:
+    """Indices of poses (b, 4, 4) that differ by half a degree or a fiftieth of the frame, first come first.
+
+    Where each belongs to a ``group`` (b,), those of one do not stand for those of another.
+    """
     R, t = T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]
-    turned = R @ R.T < 3 - 0.01**2  # trace(R_i R_jᵀ) = 1 + 2 cos
-    moved = np.linalg.norm(t[:, None] - t[None], axis=-1) > 0.02 * model.size_mm
-    differ = turned | moved
+    differ = R @ R.T < 3 - 0.01**2  # trace(R_i R_jᵀ) = 1 + 2 cos
+    differ |= np.linalg.norm(t[:, None] - t[None], axis=-1) > 0.02 * model.size_mm
+    if group is not None:
+        differ |= group[:, None] != group
     kept: list[int] = []
     for i in range(len(T)):
         if differ[i, kept].all():

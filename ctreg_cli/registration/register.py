@@ -13,8 +13,10 @@ from scipy.special import chdtrc
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.elsewhere import solutions_without_a_spot
 from ctreg_cli.registration.evidence import PosePrior
-from ctreg_cli.registration.integrity import protection_levels
+from ctreg_cli.registration.integrity import LEAST_MATCHES as LEAST_PROTECTED
+from ctreg_cli.registration.integrity import protection_levels, risk_of_each
 from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley, covariance_along_the_valley, positive_part
 from ctreg_cli.registration.matching import Matches, Scene, doubt, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
@@ -175,15 +177,36 @@ def least_matches(n_spots: int, n_rods: int) -> int:
     return LEAST_MATCHES if min(n_spots, n_rods) <= _FEW else LEAST_MATCHES + 1
 
 
-def protected(model: RodModel, scene: Scene, best: Candidate, options: RegistrationOptions) -> Candidate:
-    """The candidate with its protection levels."""
+def protected(
+    model: RodModel, scene: Scene, best: Candidate, options: RegistrationOptions, matches: Matches | None = None
+) -> Candidate:
+    """The candidate with its protection levels.
+
+    ``matches``, where they are given, are what else was found; those whose odds the risk does not allow to be
+    neglected lie within the levels.
+    """
+    risk, n = options.integrity_risk, len(best.rod_index)
+    solutions: list[tuple[FloatArray, IntArray]] = []
+    if n >= LEAST_PROTECTED:
+        spot_of_rod = _spots_of_rods(model, best)[0]
+        neglected_p = risk_of_each(risk, n)
+        solutions.append(
+            solutions_without_a_spot(
+                model, scene, best.T_slice_model, spot_of_rod, neglected_p=neglected_p, inflation=best.inflation
+            )
+        )
+        if matches is not None:
+            rival = matches.log_odds > best.log_odds + math.log(risk)
+            solutions.append((matches.T[rival], matches.spot_of_rod[rival]))
     level = protection_levels(
         model,
         best.T_slice_model,
         best.covariance,
         _seen_by(model, scene, best),
-        options.integrity_risk,
+        [(T, observations(scene, spots)) for T, spots in solutions],
+        risk,
         inflation=best.inflation,
+        prior=scene.prior,
     )
     return replace(best, protection_mm=frozen(level, (None,)))
 
@@ -308,7 +331,7 @@ def decide(
         warnings.append(
             ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
         )
-    best = protected(model, scene, best, options)
+    best = protected(model, scene, best, options, matches)
     if options.alert_limit_mm is not None and not rivals and best.protection_mm.max() > options.alert_limit_mm:
         return refused("unprotected")
     warnings.extend(fit_warnings(model, spots, best))
