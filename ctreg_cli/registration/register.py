@@ -188,7 +188,7 @@ def protected(
     risk, n = options.integrity_risk, len(best.rod_index)
     solutions: list[tuple[FloatArray, IntArray]] = []
     if n >= LEAST_PROTECTED:
-        spot_of_rod = _spots_of_rods(model, best)[0]
+        spot_of_rod = best.spot_of_rod(len(model))
         neglected_p = risk_of_each(risk, n)
         solutions.append(
             solutions_without_a_spot(
@@ -211,21 +211,14 @@ def protected(
     return replace(best, protection_mm=frozen(level, (None,)))
 
 
-def _spots_of_rods(model: RodModel, candidate: Candidate) -> IntArray:
-    """(1, n) the spot of each rod in a candidate's matches, −1 for none."""
-    spot_of_rod = np.full((1, len(model)), -1, dtype=np.intp)
-    spot_of_rod[0, candidate.rod_index] = candidate.spot_index
-    return spot_of_rod
-
-
 def _seen_by(model: RodModel, scene: Scene, candidate: Candidate) -> Observations:
     """The one hypothesis of a candidate's matches."""
-    return observations(scene, _spots_of_rods(model, candidate))
+    return observations(scene, candidate.spot_of_rod(len(model))[None])
 
 
 def _seen_or_nearly(model: RodModel, scene: Scene, scale: Scale, best: Candidate) -> Observations:
     """A candidate's matches, and free spots beside the places of rods it misses."""
-    spot_of_rod = _spots_of_rods(model, best)
+    spot_of_rod = best.spot_of_rod(len(model))[None]
     free = np.setdiff1d(np.arange(len(scene.xy_mm)), best.spot_index)
     for rod, place_mm in zip(best.missing_rods, best.missing_px * scale.mm_per_px, strict=True):
         gap = np.linalg.norm(scene.xy_mm[free] - place_mm, axis=1)
@@ -446,7 +439,7 @@ def _fits_better_loosely(model: RodModel, scene: Scene, best: Candidate) -> bool
     many = min(n_free, len(best.missing_rods)) >= 2
     if many and float(matches.log_odds[0]) + _LOG_PRIOR_LOOSE > best.log_odds:
         return True
-    spot_of_rod = _spots_of_rods(model, best)[0]
+    spot_of_rod = best.spot_of_rod(len(model))
     return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, matches) > -RIVAL_LOG_ODDS
 
 
@@ -478,7 +471,7 @@ def _fits_better_turned(model: RodModel, scene: Scene, best: Candidate) -> bool:
 
     A frame that is nearly its own image has such matches: with a wrong scale the wrong one can fit better.
     """
-    spot_of_rod = _spots_of_rods(model, best)[0]
+    spot_of_rod = best.spot_of_rod(len(model))
     loose = loose_matches(model, scene, len(best.rod_index))
     if loose is not None:
         loose = loose.subset((loose.spot_of_rod != spot_of_rod).any(axis=1))
