@@ -155,7 +155,7 @@ def test_few_rods_for_long_are_never_surely_wrong() -> None:
                 error = poses.difference(best.T_slice_model, T)
                 d2 = float(error @ np.linalg.solve(best.covariance, error))
                 assert d2 < WRONG_D2, (seed, result.index, d2)
-        assert sum(result.status == "ok" for result in results) > 30, seed
+        assert sum(result.status == "ok" for result in results) > 20, seed
 
 
 def half_turned(point: list[float]) -> np.ndarray:
