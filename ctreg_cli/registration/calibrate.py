@@ -1,7 +1,7 @@
 """Pixel scales from slices of a known frame: labels unknown, scales unknown (Doignon et al. 2008, §2, eq. 6).
 
 One slice bounds a scale to about a percent, so all slices are solved jointly: shared s_x and s_y, one pose each, and
-where the frame has a ``tolerance``, one shared displacement a rod. Labels come from the matcher, which wants a scale:
+where the frame has a ``tolerance``, the rods' true lines. Labels come from the matcher, which wants a scale:
 DICOM's PixelSpacing is tried first, and where there is none or it does not fit, a logarithmic grid over every scale a
 scanner has.
 """
@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.checks import demand
 from ctreg_cli.errors import CalibrationError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.adjustment import ScanSpots, adjust
 from ctreg_cli.registration.matching import search
 from ctreg_cli.registration.options import RegistrationOptions
-from ctreg_cli.registration.refine import Observations, ScaleFit, refine_scales
+from ctreg_cli.registration.refine import Observations, refine_scales
 from ctreg_cli.registration.register import BAD_FIT_P, INFLATE_P, make_scene, register
 from ctreg_cli.registration.result import Registration
 from ctreg_cli.rods import RodModel
@@ -90,6 +91,23 @@ class _Labelled:
     log_odds: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fit:
+    """Shared scales and one pose a slice; covariances as if the spots' own were true."""
+
+    #: (2,) and (2, 2)
+    mm_per_px: FloatArray
+    covariance: FloatArray
+    #: (b, 4, 4) and (b, 6, 6), with the uncertain scale in them
+    T: FloatArray
+    pose_covariance: FloatArray
+    #: (b, n) and (b, n, 2) measured minus predicted
+    matched: BoolArray
+    residual_px: FloatArray
+    chi2: float
+    degrees_of_freedom: int
+
+
 def calibrate(
     slices: Iterable[SpotSlice], model: RodModel, *, options: RegistrationOptions | None = None
 ) -> CalibrationRun:
@@ -116,7 +134,7 @@ def calibrate(
             "look at the spots with: ctreg segment --overlay DIR"
         )
     nominal = _common_nominal(slices, usable)
-    fit: ScaleFit | None = None
+    fit: _Fit | None = None
     labelled: list[_Labelled] = []
     if nominal is not None:
         labelled, fit = _fit_from(slices, usable, model, nominal, _SLACK_NOMINAL, options)
@@ -148,7 +166,7 @@ def _fit_from(
     start: Scale,
     slack: float,
     options: RegistrationOptions,
-) -> tuple[list[_Labelled], ScaleFit | None]:
+) -> tuple[list[_Labelled], _Fit | None]:
     """Label at a scale, fit, label again at the fitted one, until the labels stay."""
     scale, labelled, fit = start, list[_Labelled](), None
     before: object = None
@@ -156,7 +174,7 @@ def _fit_from(
         labelled = [x for x in (_label(slices[p], p, model, scale, slack, options) for p in usable) if x is not None]
         if not labelled:
             return [], None
-        fit = fit_scales(slices, labelled, model, scale)
+        fit = _fit(slices, labelled, model, scale)
         if not _believable(fit):
             return [], None
         scale = Scale(s_x=float(fit.mm_per_px[0]), s_y=float(fit.mm_per_px[1]))
@@ -167,7 +185,7 @@ def _fit_from(
     return labelled, fit
 
 
-def _believable(fit: ScaleFit) -> bool:
+def _believable(fit: _Fit) -> bool:
     low, high = SCALE_RANGE
     sd = np.sqrt(np.diag(fit.covariance))
     return bool(
@@ -213,20 +231,54 @@ def _loosened(spots: Spots, model: RodModel, scale: Scale, slack: float) -> Spot
     return Spots(uv_px=spots.uv_px, covariance_px=spots.covariance_px + extra)
 
 
-def fit_scales(slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model: RodModel, start: Scale) -> ScaleFit:
-    """Shared scales and one pose a slice, from labelled spots (weighted by their covariances)."""
+def _fit(slices: Sequence[SpotSlice], labelled: Sequence[_Labelled], model: RodModel, start: Scale) -> _Fit:
+    """Shared scales and one pose a slice, from labelled spots (weighted by their covariances).
+
+    Rods that have a tolerance lean as well as lie beside their drawing, the same in every slice: their lines are
+    estimated along (:func:`~ctreg_cli.registration.adjustment.adjust`), or they would pull at the scales.
+    """
     uv = np.stack([slices[x.place].spots.uv_px[x.spot_of_rod] for x in labelled])
     covariance = np.stack([slices[x.place].spots.covariance_px[x.spot_of_rod] for x in labelled])
     matched = np.stack([x.spot_of_rod >= 0 for x in labelled])
     T = np.stack([x.T for x in labelled])
     seen = Observations(uv_px=uv, covariance_px=covariance, matched=matched, mm_per_px=start.mm_per_px)
     with np.errstate(invalid="ignore", divide="ignore"):  # what runs away is not believed
-        return refine_scales(model, T, seen)
+        fit = refine_scales(model, T, seen)
+    if not (model.tolerances > 0).any() or not np.isfinite(fit.chi2):
+        return _Fit(
+            mm_per_px=fit.mm_per_px,
+            covariance=fit.covariance,
+            T=fit.T,
+            pose_covariance=fit.pose_covariance,
+            matched=matched,
+            residual_px=fit.linearisation.residual_px,
+            chi2=fit.chi2,
+            degrees_of_freedom=fit.degrees_of_freedom,
+        )
+    b = len(labelled)
+    scan = ScanSpots(
+        observations=replace(seen, mm_per_px=np.tile(fit.mm_per_px, (b, 1))),
+        T_patient_slice=np.tile(np.eye(4), (b, 1, 1)),
+        pose_index=np.arange(b),
+    )
+    found = adjust(model, fit.T, scan, free_scales=True, reject=False)
+    scale = fit.mm_per_px * np.exp(found.log_scale)
+    widened = found.inflation**2
+    return _Fit(
+        mm_per_px=scale,
+        covariance=found.log_scale_covariance / widened * np.outer(scale, scale),
+        T=found.T_patient_model,
+        pose_covariance=found.covariance / widened,
+        matched=matched,
+        residual_px=found.residual_px,
+        chi2=found.chi2,
+        degrees_of_freedom=found.degrees_of_freedom,
+    )
 
 
 def _search_scales(
     slices: Sequence[SpotSlice], usable: list[int], model: RodModel, options: RegistrationOptions
-) -> tuple[list[_Labelled], ScaleFit | None]:
+) -> tuple[list[_Labelled], _Fit | None]:
     """Walk the grid of scales on one slice; the scale that explains most, confirmed on all slices, wins.
 
     Nearly all rods seen is the quick and likely case and is tried for every aspect ratio first; a match of few of them
@@ -247,7 +299,7 @@ def _search_scales(
             odds = _odds_at(first, model, scale, options, least)
             if odds > _START_LOG_ODDS:
                 starts.append((odds, scale))
-        best: tuple[float, list[_Labelled], ScaleFit] | None = None
+        best: tuple[float, list[_Labelled], _Fit] | None = None
         for _, scale in sorted(starts, key=lambda x: -x[0])[:_MOST_STARTS]:
             labelled, fit = _fit_from(slices, usable, model, scale, _SLACK_GRID, options)
             if fit is None:
@@ -276,14 +328,13 @@ def _odds_at(item: SpotSlice, model: RodModel, scale: Scale, options: Registrati
 
 
 def _report(
-    slices: Sequence[SpotSlice], model: RodModel, nominal: Scale | None, labelled: list[_Labelled], fit: ScaleFit
+    slices: Sequence[SpotSlice], model: RodModel, nominal: Scale | None, labelled: list[_Labelled], fit: _Fit
 ) -> CalibrationRun:
     inflation = 1.0
     if chdtrc(fit.degrees_of_freedom, fit.chi2) < INFLATE_P:
         inflation = math.sqrt(fit.chi2 / fit.degrees_of_freedom)
     sd = np.sqrt(np.diag(fit.covariance)) * inflation
-    matched = np.stack([x.spot_of_rod >= 0 for x in labelled])
-    residual = fit.linearisation.residual_px[matched]
+    residual = fit.residual_px[fit.matched]
     used = tuple(x.place for x in labelled)
     left_out = {
         place: "unreadable" if item.problem else "too_few_spots" if len(item.spots) < _LEAST_SPOTS else "not_certain"
@@ -295,7 +346,7 @@ def _report(
         sd_s_x=float(sd[0]),
         sd_s_y=float(sd[1]),
         n_slices=len(labelled),
-        n_spots=int(matched.sum()),
+        n_spots=int(fit.matched.sum()),
         rms_px=float(np.sqrt((residual**2).mean())),
         nominal=nominal,
         model_name=model.name,
