@@ -2,9 +2,10 @@
 
 The state is the pose and the velocity of the frame's middle, in axes that the table does not move (patient axes where
 the slices have patient geometry, slice axes elsewhere). The velocity drifts as a Wiener process; its intensity, one
-number for translation and one for rotation, follows the innovations by recursive maximum likelihood with a fading
-memory (Ljung & Söderström, *Theory and Practice of Recursive Identification*, 1983, §3.7). Errors live in the tangent
-space of the pose (``R ← exp([Ω]ₓ) R``, ``c ← c + V``), covariances are 12 × 12: pose error, then velocity error.
+number along and one about every axis (breathing goes one way), follows the innovations by recursive maximum likelihood
+with a fading memory (Ljung & Söderström, *Theory and Practice of Recursive Identification*, 1983, §3.7). Errors live in
+the tangent space of the pose (``R ← exp([Ω]ₓ) R``, ``c ← c + V``), covariances are 12 × 12: pose error, then velocity
+error.
 """
 
 from __future__ import annotations
@@ -23,15 +24,18 @@ Prediction = Literal["velocity", "identity"]
 _DEG = math.radians(1.0)
 #: velocity of a frame of which nothing is known, sd, mm/s and rad/s: breathing, not a fall
 FIRST_VELOCITY_SD = (6.0, 3.0 * _DEG)
-#: intensity of the velocity's drift to start from, mm²/s³ and rad²/s³; it is never taken to be less than the second
-FIRST_INTENSITY = (20.0, 20.0 * _DEG**2)
-LEAST_INTENSITY = (0.05, 0.05 * _DEG**2)
-MOST_INTENSITY = (1e5, 1e5 * _DEG**2)
+#: intensity of the velocity's drift to start from, along and about the axes, mm²/s³ and rad²/s³; it is never taken to
+#: be less than the second
+FIRST_INTENSITY = (*3 * (20.0,), *3 * (20.0 * _DEG**2,))
+LEAST_INTENSITY = (*3 * (0.05,), *3 * (0.05 * _DEG**2,))
+MOST_INTENSITY = (*3 * (1e5,), *3 * (1e5 * _DEG**2,))
 #: a slice is never predicted better than this, and the doubt grows with time, sd, mm and rad (a second: per √s)
 LEAST_STEP_SD = (0.15, 0.15 * _DEG)
 DOUBT_SD = (0.3, 0.3 * _DEG)
 #: how fast old innovations are forgotten, and the longest step (ln) that one slice may change an intensity by
 MEMORY, LEAST_LOG_STEP, MOST_LOG_STEP = 0.95, -0.5, 2.5
+#: the variance of a velocity that is filtered from positions grows as this power of the intensity (Kalata 1984)
+_SHARE_OF_VELOCITY = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,9 +48,9 @@ class MotionState:
     velocity: FloatArray
     #: (12, 12) of pose and velocity, but for what lasts
     covariance: FloatArray
-    #: intensity of the velocity's drift, translation and rotation; the information gathered about its logarithm
-    intensity: tuple[float, float]
-    information: tuple[float, float]
+    #: (6,) intensity of the velocity's drift along and about the axes; the information gathered about its logarithm
+    intensity: tuple[float, ...]
+    information: tuple[float, ...]
     #: time that the motion has been watched for
     elapsed_s: float = 0.0
     #: (12, m) what errors that last (:mod:`.lasting`) do to pose and velocity, each of sd one; None: none
@@ -71,7 +75,7 @@ def start(
     T: FloatArray,
     covariance: FloatArray,
     kind: Prediction,
-    intensity: tuple[float, float] = FIRST_INTENSITY,
+    intensity: tuple[float, ...] = FIRST_INTENSITY,
     lasting: FloatArray | None = None,
 ) -> MotionState:
     """The motion of a frame seen once.
@@ -92,7 +96,7 @@ def start(
         velocity=np.zeros(6),
         covariance=full,
         intensity=intensity,
-        information=(0.0, 0.0),
+        information=6 * (0.0,),
         lasting=None if lasting is None else np.concatenate([lasting, np.zeros_like(lasting)]),
     )
 
@@ -101,21 +105,19 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
     P = state.covariance.copy()
     diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
-    place, turn = dt_s * state.intensity[0], dt_s * state.intensity[1]
+    drifted = np.array(state.intensity)
+    drifted *= dt_s
     if kind == "velocity":
         P[:6] += dt_s * P[6:]
         P[:, :6] += dt_s * P[:, 6:]
-        drifted = _each_axis(place, turn)
         diagonals[_VELOCITY] += drifted
         drifted *= 0.5 * dt_s
         diagonals[_POSE_VELOCITY] += drifted
         diagonals[_VELOCITY_POSE] += drifted
-        place, turn = dt_s**2 / 3 * place, dt_s**2 / 3 * turn
+        drifted *= dt_s / 1.5
     # never less than a doubt that grows with time
-    diagonals[_POSE] += _each_axis(
-        place + _LEAST2[0] + dt_s * _DOUBT2[0],
-        turn + _LEAST2[1] + dt_s * _DOUBT2[1],
-    )
+    drifted += _each_axis(_LEAST2[0] + dt_s * _DOUBT2[0], _LEAST2[1] + dt_s * _DOUBT2[1])
+    diagonals[_POSE] += drifted
     lasting = state.lasting
     if lasting is not None and kind == "velocity":
         lasting = np.concatenate([lasting[:6] + dt_s * lasting[6:], lasting[6:]])
@@ -174,21 +176,23 @@ def _lasting(predicted: FloatArray | None, gain: FloatArray, measured: FloatArra
 
 def _learn(
     predicted: MotionState, S_inverse: FloatArray, innovation: FloatArray, dt_s: float, kind: Prediction
-) -> tuple[tuple[float, float], tuple[float, float]]:
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """One step of maximum likelihood on the logarithms of the intensities; none where measurement noise drowns them."""
-    z, rows = S_inverse.dot(innovation).tolist(), S_inverse.tolist()
-    pair = []
-    for i, (intensity, old) in enumerate(zip(predicted.intensity, predicted.information, strict=True)):
-        j, k, l = range(3 * i, 3 * i + 3)  # translation, then rotation
-        trace = rows[j][j] + rows[k][k] + rows[l][l]
-        squares = sum([element * element for row in rows[j : l + 1] for element in row[j : l + 1]])
-        share = intensity * (dt_s**3 / 3 if kind == "velocity" else dt_s)
-        score = 0.5 * share * (z[j] * z[j] + z[k] * z[k] + z[l] * z[l] - trace)
-        information = MEMORY * old + 0.5 * share**2 * squares
+    z, weights = S_inverse.dot(innovation).tolist(), S_inverse.diagonal().tolist()
+    variances = predicted.covariance.diagonal()[6:].tolist()
+    intensities, gathered = [], []
+    for k, (intensity, old) in enumerate(zip(predicted.intensity, predicted.information, strict=True)):
+        # how much of the innovation's variance grows with the intensity: the drift since, and that of the slices
+        # before, which is in the velocity's variance
+        share = dt_s * intensity
+        if kind == "velocity":
+            share = dt_s**2 * (_SHARE_OF_VELOCITY * max(variances[k] - share, 0.0) + share / 3)
+        score = 0.5 * share * (z[k] * z[k] - weights[k])
+        information = MEMORY * old + 0.5 * (share * weights[k]) ** 2
         log_step = min(max(score / (1.0 + information), LEAST_LOG_STEP), MOST_LOG_STEP)
-        pair.append((min(max(intensity * math.exp(log_step), LEAST_INTENSITY[i]), MOST_INTENSITY[i]), information))
-    (of_place, known_of_place), (of_turn, known_of_turn) = pair
-    return (of_place, of_turn), (known_of_place, known_of_turn)
+        intensities.append(min(max(intensity * math.exp(log_step), LEAST_INTENSITY[k]), MOST_INTENSITY[k]))
+        gathered.append(information)
+    return tuple(intensities), tuple(gathered)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -62,7 +62,7 @@ def smooth(measured: Sequence[TimedPose]) -> list[TimedPose]:
     z_C = np.stack([m.covariance for m in measured])
     new = np.array([True, *((a.T != b.T).any() for a, b in zip(measured[1:], measured[:-1], strict=True))])
     nominal = z_T.copy()
-    drift = np.diag(np.repeat(FIRST_INTENSITY, 3))
+    drift = np.diag(FIRST_INTENSITY)
     n_learn = min(len(measured), LEARN_FROM)
     part = slice(0, n_learn)
     for round_ in range(ROUNDS):
@@ -148,7 +148,7 @@ def _learnt(passed: _Pass, dt: FloatArray) -> FloatArray:
     inverse = np.linalg.inv(_shape_of_drift(dt[use]))
     blocks = second.reshape(-1, 2, 6, 2, 6)
     total = np.einsum("nij,niajb->ab", inverse, blocks)
-    prior = PRIOR_SLICES * PRIOR_SHARE * np.diag(np.repeat(FIRST_INTENSITY, 3))
+    prior = PRIOR_SLICES * PRIOR_SHARE * np.diag(FIRST_INTENSITY)
     drift: FloatArray = (0.5 * total + prior) / (int(use.sum()) + PRIOR_SLICES)
     return 0.5 * (drift + drift.T)
 
