@@ -136,6 +136,7 @@ def test_what_is_promised_along_the_weakest_way_has_been_charged() -> None:
 
 def test_few_rods_for_long_are_never_surely_wrong() -> None:
     """All but five rods hidden after fifteen slices; the seeds were picked because they were wrong once."""
+    n_ok = 0
     for seed in (7, 11, 12):
         rng = np.random.default_rng(seed)
         made = sequence(seed, kind="breathing", n=70, p_missing=0.0, most_false=0, sd_px=0.25)
@@ -155,7 +156,8 @@ def test_few_rods_for_long_are_never_surely_wrong() -> None:
                 error = poses.difference(best.T_slice_model, T)
                 d2 = float(error @ np.linalg.solve(best.covariance, error))
                 assert d2 < WRONG_D2, (seed, result.index, d2)
-        assert sum(result.status == "ok" for result in results) > 20, seed
+        n_ok += sum(result.status == "ok" for result in results)
+    assert n_ok > 80, n_ok  # of 210: the cuts are bad ones
 
 
 def half_turned(point: list[float]) -> np.ndarray:
