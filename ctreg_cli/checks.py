@@ -7,6 +7,11 @@ from numbers import Real
 
 from ctreg_cli.errors import InputError
 
+#: mm per pixel that an image may have
+SCALES_MM = (1e-6, 1e3)
+#: px that a spot's place may be unsure by: less is no measurement, but would outweigh every other spot
+SPOT_SDS_PX = (1e-6, 1e6)
+
 
 def is_number(value: object) -> bool:
     """Whether it is a finite real number; True and False are none."""

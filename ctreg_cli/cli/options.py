@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ctreg_cli.checks import SCALES_MM, SPOT_SDS_PX
 from ctreg_cli.errors import InputError
 from ctreg_cli.registration.options import RegistrationOptions, TrackingOptions
 
@@ -25,12 +26,6 @@ class Jacobian(StrEnum):
 
     updated = "updated"
     constant = "constant"
-
-
-#: mm per pixel that anything in a scanner's room may have
-SCALES_MM = (1e-6, 1e3)
-#: px that a spot's place may be unsure by, as in a spots file
-SPOT_SDS_PX = (1e-6, 1e6)
 
 
 def _positive(value: float | None) -> float | None:

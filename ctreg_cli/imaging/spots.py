@@ -18,7 +18,7 @@ from ctreg_cli.errors import InputError
 DEFAULT_SPOT_SD_PX = 0.25
 
 #: relative asymmetry of a covariance that is no mistake
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 
 _ARRAYS = ("uv_px", "covariance_px", "area_px", "contrast", "major_px", "minor_px", "angle_rad")
 
@@ -84,7 +84,7 @@ class Spots:
                 )
         # plain numbers: for a few spots a third of what arrays cost
         for spot, ((a, b), (c, d)) in enumerate(self.covariance_px.tolist()):
-            is_symmetric = abs(b - c) <= _ROUNDING * (a + d)
+            is_symmetric = abs(b - c) <= ROUNDING * (a + d)
             if not (is_symmetric and a + d > math.hypot(a - d, b + c) and a + d < math.inf):
                 raise InputError(
                     f"covariance_px: spot {spot} has {[[a, b], [c, d]]}; give a symmetric positive definite matrix in "

@@ -12,12 +12,12 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from ctreg_cli.checks import demand, is_number
+from ctreg_cli.checks import SPOT_SDS_PX, demand, is_number
 from ctreg_cli.errors import SpotsFileError
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import DEFAULT_SPOT_SD_PX
 from ctreg_cli.io.spots_file import COLUMNS, SCHEMA
-from ctreg_cli.io.spots_schema import MAX_COORDINATE_PX, MIN_SD_PX, SliceRecord, SpotsDocument
+from ctreg_cli.io.spots_schema import SliceRecord, SpotsDocument
 
 NEEDED = ("slice", "u_px", "v_px")
 #: what is the same in every line of a slice
@@ -44,8 +44,8 @@ def parse_spots(
     Raises:
         SpotsFileError: as :func:`ctreg_cli.io.spots_file.read_spots`.
     """
-    is_sd = is_number(spot_sd_px) and MIN_SD_PX <= spot_sd_px <= MAX_COORDINATE_PX
-    demand(is_sd, "spot_sd_px", spot_sd_px, f"pixels from {MIN_SD_PX:g} to {MAX_COORDINATE_PX:g}")
+    is_sd = is_number(spot_sd_px) and SPOT_SDS_PX[0] <= spot_sd_px <= SPOT_SDS_PX[1]
+    demand(is_sd, "spot_sd_px", spot_sd_px, f"pixels from {SPOT_SDS_PX[0]:g} to {SPOT_SDS_PX[1]:g}")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

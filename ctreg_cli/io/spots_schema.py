@@ -10,24 +10,19 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 from pydantic_core import PydanticCustomError
 
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.checks import SCALES_MM, SPOT_SDS_PX
 from ctreg_cli.geometry.patient import patient_from_slice, slice_axes
 from ctreg_cli.geometry.pose import is_pose
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
-from ctreg_cli.imaging.spots import RejectedSpot, Spots
+from ctreg_cli.imaging.spots import ROUNDING, RejectedSpot, Spots
 from ctreg_cli.scale import Scale
 
 #: a place beyond this (px) is no place in an image
 MAX_COORDINATE_PX = 1e6
-#: a standard deviation below this (px) is no measurement, but would outweigh every other spot
-MIN_SD_PX = 1e-6
-#: mm per pixel that an image may have
-SCALES_MM = (1e-6, 1e3)
-#: relative asymmetry of a covariance that is no mistake
-ROUNDING = 1e-9
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
-Sd = Annotated[float, Field(ge=MIN_SD_PX, le=MAX_COORDINATE_PX)]
+Sd = Annotated[float, Field(ge=SPOT_SDS_PX[0], le=SPOT_SDS_PX[1])]
 Positive = Annotated[float, Field(gt=0)]
 MmPerPx = Annotated[float, Field(ge=SCALES_MM[0], le=SCALES_MM[1])]
 Matrix2 = tuple[tuple[float, float], tuple[float, float]]
@@ -81,7 +76,7 @@ class SpotRecord(_Record):
         # a computed matrix may miss symmetry by its last bits
         is_symmetric = abs(uv - vu) <= ROUNDING * (uu + vv)
         least_variance = (uu + vv - math.hypot(uu - vv, 2 * uv)) / 2
-        if not is_symmetric or least_variance < MIN_SD_PX**2 / 2:
+        if not is_symmetric or least_variance < SPOT_SDS_PX[0] ** 2 / 2:
             raise _mistake("covariance: must be symmetric and positive definite")
         return self
 

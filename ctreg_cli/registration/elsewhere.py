@@ -20,8 +20,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.registration.matching import Matches, Scene, distinct_poses, noise_mm, observations, weigh
-from ctreg_cli.registration.minimal import RodTriples, solve_three
+from ctreg_cli.registration.matching import Matches, Scene, distinct_poses, observations, roots_of_triples, weigh
 from ctreg_cli.registration.refine import Linearisation, linearise, refine
 from ctreg_cli.rods import RodModel
 
@@ -109,14 +108,7 @@ def _roots(model: RodModel, scene: Scene, spot_of_rod: IntArray, matched: IntArr
     triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
     most = _TRIPLES if len(matched) < _MANY_MATCHES else _FEWER_TRIPLES
     triples = triples[:: -(-len(triples) // most)]
-    noise = noise_mm(model, scene)
-    T, _ = solve_three(
-        RodTriples.of(model, triples),
-        scene.xy_mm[spot_of_rod[triples]],
-        slack_mm=3 * noise + 2 * scene.half_slab_mm,
-        noise_mm=noise,
-    )
-    return T[scene.prior.allows(T[:, :3, :3])]
+    return roots_of_triples(model, scene, spot_of_rod, triples)
 
 
 def _steps_without(model: RodModel, fit: Linearisation, matched: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ ellipsoid can still hold it, the covariance is made to; where not, nothing small
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -256,12 +256,7 @@ def _profile(
 ) -> _Profile:
     """Follow the last of ``axes`` (6, 6) by ``steps`` (b,) while the others give way."""
     b = len(steps)
-    repeated = replace(
-        seen,
-        uv_px=np.repeat(seen.uv_px, b, axis=0),
-        covariance_px=np.repeat(seen.covariance_px, b, axis=0),
-        matched=np.repeat(seen.matched, b, axis=0),
-    )
+    repeated = seen.subset(np.zeros(b, dtype=np.intp))
     here = linearise(model, T[None], seen)
     moved = poses.update(np.repeat(T[None], b, axis=0), steps[:, None] * axes[:, -1])
     basis = axes[:, :-1]

@@ -772,6 +772,18 @@ def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int
     return all_found
 
 
+def roots_of_triples(model: RodModel, scene: Scene, spot_of_rod: IntArray, triples: IntArray) -> FloatArray:
+    """(s, 4, 4) poses that three of a match's spots allow, for each of its ``triples`` of rods (t, 3)."""
+    noise = noise_mm(model, scene)
+    T, _ = solve_three(
+        RodTriples.of(model, triples),
+        scene.xy_mm[spot_of_rod[triples]],
+        slack_mm=3 * noise + 2 * scene.half_slab_mm,
+        noise_mm=noise,
+    )
+    return T[scene.prior.allows(T[:, :3, :3])]
+
+
 def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
     """The same matches, refined from every root of their triples; and what all spots say of the minima found."""
     spot_of_rod = matches.spot_of_rod[row]
@@ -780,14 +792,7 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     most = _RESTARTS if len(matched) < _MANY_MATCHES else _RESTARTS // 2
     if len(triples) > most:  # many matches: twins are rare, and each of them shows in most triples
         triples = triples[:: len(triples) // most + 1]
-    noise = noise_mm(model, scene)
-    T, _ = solve_three(
-        RodTriples.of(model, triples),
-        scene.xy_mm[spot_of_rod[triples]],
-        slack_mm=3 * noise + 2 * scene.half_slab_mm,
-        noise_mm=noise,
-    )
-    T = T[scene.prior.allows(T[:, :3, :3])]
+    T = roots_of_triples(model, scene, spot_of_rod, triples)
     if len(T) == 0:
         return None
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))

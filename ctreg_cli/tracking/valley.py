@@ -7,7 +7,6 @@ times over is sure of a wrong place. So the valley is walked along, and no more 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import product
 from typing import NamedTuple
@@ -63,12 +62,7 @@ def walked_along(
     ways = _ways(weak)
     far = np.repeat(_LOOKED_AT_SD, len(ways))
     out = np.tile(ways / sd[:weak] @ axes[:, :weak].T, (len(_LOOKED_AT_SD), 1))
-    several = replace(
-        seen,
-        uv_px=np.repeat(seen.uv_px, len(far), axis=0),
-        covariance_px=np.repeat(seen.covariance_px, len(far), axis=0),
-        matched=np.repeat(seen.matched, len(far), axis=0),
-    )
+    several = seen.subset(np.zeros(len(far), dtype=np.intp))
 
     def cost(stack: FloatArray, observed: Observations) -> FloatArray:
         off = poses.difference(stack, T_predicted)
