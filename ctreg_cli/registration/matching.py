@@ -37,6 +37,7 @@ from ctreg_cli.registration.refine import (
     Observations,
     covariance_from_information,
     invert_2x2,
+    linearise,
     refine,
 )
 from ctreg_cli.rods import RodModel
@@ -53,6 +54,9 @@ LEAST_CHECKED = 4
 _COVER = 2
 #: ln odds beyond which a match is no chance (10⁹ : 1, Lang et al. 2010): only its own spots can tell another story
 BEYOND_CHANCE = math.log(1e9)
+#: ... and beyond which a match of all rods is none among so many spots that each rod triple takes a second: chance
+#: matches there are of a few rods
+_BEYOND_CHANCE_OF_ALL = math.log(1e7)
 #: ln odds below which no match is believed; up to so many spots, all rod triples are then tried
 _BELIEVABLE, _FEW_SPOTS = math.log(100), 12
 #: hypotheses a stage hands on to refinement
@@ -80,6 +84,8 @@ _RESTARTS = 20
 _MANY_MATCHES = 8
 #: starts that are refined, and minima that are weighed
 _MOST_STARTS, _MOST_MINIMA = 48, 8
+#: variants that promise a χ² so much above the best are not refined: hundreds of nats, and they take the most steps
+_HOPELESS_CHI2 = 1e3
 #: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
 _VERIFY_STEPS = (12, 6)
 #: share of a determinant that rounding can feign
@@ -292,7 +298,7 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
             found.append(part)
             if best is None or part.log_odds[0] > best.log_odds[0]:
                 best = part.subset(np.array([0]))
-                if best.log_odds[0] > BEYOND_CHANCE:
+                if _is_beyond_chance(best, m):
                     start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
     if m <= _FEW_SPOTS and done < len(layout.triples) and (best is None or best.log_odds[0] < _BELIEVABLE):
         # noise can take every root from each of the few triples that hold the rods seen: here all can be afforded
@@ -306,6 +312,12 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
     if not found:
         return None
     return distinct(model, join(found))
+
+
+def _is_beyond_chance(best: Matches, n_spots: int) -> bool:
+    """Whether the match found need not be looked for a rival of other spots."""
+    all_seen = n_spots > _MANY_SPOTS and bool((best.spot_of_rod[0] >= 0).all())
+    return bool(best.log_odds[0] > (_BEYOND_CHANCE_OF_ALL if all_seen else BEYOND_CHANCE))
 
 
 def _second_frame(model: RodModel, scene: Scene, best: Matches, least_matches: int) -> Matches | None:
@@ -803,10 +815,12 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
         order = np.argsort(fit.chi2, kind="stable")
         order = order[distinct_poses(model, T[order])[:kept]]
         T, fit = T[order], fit.subset(order)
+    hopeful = fit.chi2 < fit.chi2[0] + _HOPELESS_CHI2
     # what speaks for another minimum is often a spot that the first one could not use: all vote again
     same, again = same[: len(T)], assign(model, scene, T, fit)
     other = (again != same).any(axis=1)
-    return weigh(model, scene, np.concatenate([T, T[other]]), np.concatenate([same, again[other]]), least_matches)
+    T, spot_of_rod = np.concatenate([T[hopeful], T[other]]), np.concatenate([same[hopeful], again[other]])
+    return weigh(model, scene, T, spot_of_rod, least_matches)
 
 
 def distinct_poses(model: RodModel, T: FloatArray, group: IntArray | None = None) -> IntArray:
@@ -874,4 +888,7 @@ def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_match
     starts_all = np.concatenate(starts) if starts else np.empty((0, 4, 4))
     _, first = np.unique(np.concatenate([spot_of_rod[None], variants_all]), axis=0, return_index=True)
     new = np.sort(first[first > 0]) - 1
-    return weigh(model, scene, starts_all[new], variants_all[new], least_matches)
+    starts_all, variants_all = starts_all[new], variants_all[new]
+    promised = linearise(model, starts_all, observations(scene, variants_all)).promised_chi2(model.size_mm)
+    hopeful = promised < matches.fit.chi2[row] + _HOPELESS_CHI2
+    return weigh(model, scene, starts_all[hopeful], variants_all[hopeful], least_matches)

@@ -236,7 +236,7 @@ def scan_three(
     # far outside on the grid is outside after polishing too
     margin = slack_mm + (high - low) / (samples - 1)
     margin = margin if len(margin) == 1 else margin[hypothesis]
-    near = ((lambdas >= -margin) & (lambdas <= own.lengths + margin)).all(axis=1)
+    near = _within(lambdas, own.lengths, margin)
     return _finish(triples, xy_mm, d2, hypothesis[near], lambdas[near], slack_mm, max(4 * noise_mm, 1e-6), 4)
 
 
@@ -283,8 +283,7 @@ def _finish(
     distance = np.sqrt(d2[hypothesis])
     own = triples.of_hypotheses(hypothesis)
     lambdas, error = _polish(own, lambdas, distance, steps)
-    good = error <= residual_mm
-    good &= (lambdas >= -slack_mm).all(axis=1) & (lambdas <= own.lengths + slack_mm).all(axis=1)
+    good = (error <= residual_mm) & _within(lambdas, own.lengths, slack_mm)
     lambdas, hypothesis = lambdas[good], hypothesis[good]
     first = _first_of_each(lambdas, hypothesis, 1e-6 * float(triples.lengths.max()))
     lambdas, hypothesis = lambdas[first], hypothesis[first]
@@ -321,7 +320,7 @@ def _polish(
         gap = P[:, i] - P[:, j]
         length = np.maximum(_norm(gap), 1e-12)
         f = length - distance
-        error = np.maximum(np.maximum(np.abs(f[:, 0]), np.abs(f[:, 1])), np.abs(f[:, 2]))
+        error = _largest(f)
         a = _dot(gap, y[:, i]) / length  # ∂f/∂λ_i
         b = -_dot(gap, y[:, j]) / length  # ∂f/∂λ_j
         # rows: (a0, b0, 0), (a1, 0, b1), (0, a2, b2); normal equations with a little damping, solved in closed form
@@ -342,7 +341,7 @@ def _polish(
         )
         lam = lam - step / np.maximum(det, 1e-30)[:, None]
     P = p + lam[..., None] * y
-    return lam, np.minimum(error, np.abs(_norm(P[:, i] - P[:, j]) - distance).max(axis=1))
+    return lam, np.minimum(error, _largest(_norm(P[:, i] - P[:, j]) - distance))
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -356,13 +355,35 @@ def _norm(a: FloatArray) -> FloatArray:
     return result
 
 
+def _largest(a: FloatArray) -> FloatArray:
+    """The greatest magnitude (r,) of each row (r, 3)."""
+    result: FloatArray = np.maximum(np.maximum(np.abs(a[:, 0]), np.abs(a[:, 1])), np.abs(a[:, 2]))
+    return result
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a × b of stacks (r, 3)."""
+    result: FloatArray = np.empty_like(a)
+    result[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    result[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    result[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return result
+
+
+def _within(lambdas: FloatArray, lengths: FloatArray, slack_mm: FloatArray | float) -> BoolArray:
+    """Which λ (r, 3) lie on all three rods, or no more than the slack beyond (r, 1)."""
+    inside = (lambdas >= -slack_mm) & (lambdas <= lengths + slack_mm)
+    result: BoolArray = inside[:, 0] & inside[:, 1] & inside[:, 2]
+    return result
+
+
 def _first_of_each(lambdas: FloatArray, hypothesis: IntArray, tolerance_mm: float) -> IntArray:
     """Indices of solutions that differ: one of each (hypothesis, λ) up to the tolerance."""
     order = np.lexsort((lambdas[:, 2], lambdas[:, 1], lambdas[:, 0], hypothesis))
     near = np.zeros(len(order), dtype=bool)
     for back in (1, 2, 3, 4):  # neighbours in λ₁ order; ties in λ₁ are few
         same = (hypothesis[order[back:]] == hypothesis[order[:-back]]) & (
-            np.abs(lambdas[order[back:]] - lambdas[order[:-back]]).max(axis=1) <= tolerance_mm
+            _largest(lambdas[order[back:]] - lambdas[order[:-back]]) <= tolerance_mm
         )
         near[back:] |= same
     return np.sort(order[~near])
@@ -384,9 +405,9 @@ def _triangle_basis(P: FloatArray) -> tuple[FloatArray, BoolArray]:
     exact triangles, and refinement follows.
     """
     a, b = P[:, 1] - P[:, 0], P[:, 2] - P[:, 0]
-    n = np.cross(a, b)
-    length_a, length_n = np.linalg.norm(a, axis=1), np.linalg.norm(n, axis=1)
-    ok = length_n > 1e-9 * np.maximum(length_a, np.linalg.norm(b, axis=1)) ** 2
+    n = _cross(a, b)
+    length_a, length_n = _norm(a), _norm(n)
+    ok = length_n > 1e-9 * np.maximum(length_a, _norm(b)) ** 2
     e1 = a / np.maximum(length_a, 1e-300)[:, None]
     e3 = n / np.maximum(length_n, 1e-300)[:, None]
-    return np.stack([e1, np.cross(e3, e1), e3], axis=2), ok
+    return np.stack([e1, _cross(e3, e1), e3], axis=2), ok

@@ -86,6 +86,16 @@ class Linearisation:
         gradient = (self.residual_px.reshape(b, 1, 2 * n) @ WJ)[:, 0]
         return J.transpose(0, 2, 1) @ WJ, gradient
 
+    def promised_chi2(self, size_mm: float) -> FloatArray:
+        """The χ² (b,) that one Gauss–Newton step would leave if the spots moved in straight lines."""
+        H, g = self.normal_equations()
+        unit = np.array([1, 1, 1, *(3 * [1 / size_mm])])
+        H, g = H * (unit[:, None] * unit), g * unit
+        diagonal = H.reshape(-1, 36)[:, ::7]  # a view
+        diagonal += 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-300
+        promised: FloatArray = self.chi2 - (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1)
+        return promised
+
 
 def invert_2x2(matrices: FloatArray) -> FloatArray:
     """Inverses of (..., 2, 2) matrices, in closed form."""
@@ -150,23 +160,24 @@ def merged_covariance(
     Returns:
         The covariances, or None where there are none.
     """
-    lost = ~matched & (lambda_mm >= 0) & (lambda_mm <= model.lengths)
-    rods = np.flatnonzero(lost.any(axis=0))
-    if not len(rods):
+    lost = ~matched
+    lost &= lambda_mm >= 0
+    lost &= lambda_mm <= model.lengths
+    row, rod = np.nonzero(lost)
+    if not len(row):
         return None
-    gap = xy_mm[:, None, rods] - xy_mm[:, :, None]  # (b, matched, lost)
+    gap = xy_mm[row, rod][:, None] - xy_mm[row]  # (lost, matched, 2)
     distance2 = gap[..., 0] * gap[..., 0]
     distance2 += gap[..., 1] * gap[..., 1]
     is_near = distance2 < resolved_mm**2
-    is_near &= matched[..., None]
-    is_near &= lost[:, None, rods]
+    is_near &= matched[row]
     if not is_near.any():
         return None
     near = np.nonzero(is_near)
     g = gap[near]
     share = np.clip(2 - 2 * np.sqrt(distance2[near]) / resolved_mm, 0, 1)
     result = np.zeros((*matched.shape, 2, 2))
-    np.add.at(result, near[:2], (share / 4)[:, None, None] * g[:, :, None] * g[:, None, :])
+    np.add.at(result, (row[near[0]], near[1]), (share / 4)[:, None, None] * g[:, :, None] * g[:, None, :])
     return result
 
 
