@@ -310,38 +310,42 @@ def _polish(
     triples: RodTriples, lambdas: FloatArray, distance: FloatArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
     """Damped Newton on the three distances; returns λ (r, 3) and the largest remaining distance error (r,), mm."""
-    p, y = triples.starts, triples.directions
-    i, j = np.array([0, 0, 1]), np.array([1, 2, 2])
+    # rods and axes first, hypotheses last: whole lines of memory are worked on
+    p, y = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in (triples.starts, triples.directions))
+    i, j = [0, 0, 1], [1, 2, 2]
+    y_i, y_j = y[i], y[j]
     size2 = float(triples.lengths.max()) ** 2
-    lam = lambdas.copy()
-    error = np.full(len(lam), np.inf)
+    lam, wanted = np.array(lambdas.T, order="C"), np.ascontiguousarray(distance.T)
+    error = np.full(lam.shape[1], np.inf)
     for _ in range(steps):
-        P = p + lam[..., None] * y
-        gap = P[:, i] - P[:, j]
-        length = np.maximum(_norm(gap), 1e-12)
-        f = length - distance
-        error = _largest(f)
-        a = _dot(gap, y[:, i]) / length  # ∂f/∂λ_i
-        b = -_dot(gap, y[:, j]) / length  # ∂f/∂λ_j
+        P = p + lam[:, None] * y
+        gap = P[i] - P[j]  # (3 sides, 3 axes, r)
+        length = np.maximum(np.sqrt(_along(gap, gap)), 1e-12)
+        f = length - wanted
+        error = np.abs(f).max(axis=0)
+        a = _along(gap, y_i) / length  # ∂f/∂λ_i
+        b = -_along(gap, y_j) / length  # ∂f/∂λ_j
         # rows: (a0, b0, 0), (a1, 0, b1), (0, a2, b2); normal equations with a little damping, solved in closed form
-        n00 = a[:, 0] ** 2 + a[:, 1] ** 2
-        n11 = b[:, 0] ** 2 + a[:, 2] ** 2
-        n22 = b[:, 1] ** 2 + b[:, 2] ** 2
-        n01, n02, n12 = a[:, 0] * b[:, 0], a[:, 1] * b[:, 1], a[:, 2] * b[:, 2]
-        g0 = a[:, 0] * f[:, 0] + a[:, 1] * f[:, 1]
-        g1 = b[:, 0] * f[:, 0] + a[:, 2] * f[:, 2]
-        g2 = b[:, 1] * f[:, 1] + b[:, 2] * f[:, 2]
-        damping = 1e-9 + _dot(f, f) / size2
-        n00, n11, n22 = n00 + damping, n11 + damping, n22 + damping
+        (a0, a1, a2), (b0, b1, b2), (f0, f1, f2) = a, b, f
+        damping = 1e-9 + (f0 * f0 + f1 * f1 + f2 * f2) / size2
+        n00, n11, n22 = a0**2 + a1**2 + damping, b0**2 + a2**2 + damping, b1**2 + b2**2 + damping
+        n01, n02, n12 = a0 * b0, a1 * b1, a2 * b2
+        g0, g1, g2 = a0 * f0 + a1 * f1, b0 * f0 + a2 * f2, b1 * f1 + b2 * f2
         c00, c01, c02 = n11 * n22 - n12**2, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
-        det = n00 * c00 + n01 * c01 + n02 * c02
         c11, c12, c22 = n00 * n22 - n02**2, n01 * n02 - n00 * n12, n00 * n11 - n01**2
-        step = np.stack(
-            [c00 * g0 + c01 * g1 + c02 * g2, c01 * g0 + c11 * g1 + c12 * g2, c02 * g0 + c12 * g1 + c22 * g2], 1
-        )
-        lam = lam - step / np.maximum(det, 1e-30)[:, None]
-    P = p + lam[..., None] * y
-    return lam, np.minimum(error, _largest(_norm(P[:, i] - P[:, j]) - distance))
+        det = np.maximum(n00 * c00 + n01 * c01 + n02 * c02, 1e-30)
+        lam[0] -= (c00 * g0 + c01 * g1 + c02 * g2) / det
+        lam[1] -= (c01 * g0 + c11 * g1 + c12 * g2) / det
+        lam[2] -= (c02 * g0 + c12 * g1 + c22 * g2) / det
+    P = p + lam[:, None] * y
+    gap = P[i] - P[j]
+    return np.ascontiguousarray(lam.T), np.minimum(error, np.abs(np.sqrt(_along(gap, gap)) - wanted).max(axis=0))
+
+
+def _along(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Σ a b (3, r) over the axes of (3, 3, r), the middle one."""
+    result: FloatArray = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    return result
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
