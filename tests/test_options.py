@@ -24,6 +24,7 @@ from ctreg_cli import (
     Spots,
     SpotSlice,
     Target,
+    Tracker,
     TrackingOptions,
     calibrate,
     load_rod_model,
@@ -86,6 +87,8 @@ def test_a_scale_that_is_none_is_refused_everywhere(scale: Any) -> None:
         lambda: list(track([with_scale], FRAME, scale=scale)),
         lambda: list(pose(iter([own]), FRAME)),
         lambda: list(track(iter([own]), FRAME)),
+        lambda: Tracker(FRAME).step(spots, with_scale.info, scale),
+        lambda: Tracker(FRAME).follow(spots, with_scale.info, scale),
     ):
         with pytest.raises(InputError, match=r"scale: .*Scale\(s_x=\.\.\., s_y=\.\.\.\)"):
             ask()
@@ -94,6 +97,8 @@ def test_a_scale_that_is_none_is_refused_everywhere(scale: Any) -> None:
 def test_registering_without_a_scale_says_so() -> None:
     with pytest.raises(MissingScaleError, match=r"Scale\(s_x"):
         register(Spots.from_points(UV), FRAME, scale=None)  # type: ignore[arg-type]
+    with pytest.raises(MissingScaleError, match=r"Scale\(s_x"):
+        Tracker(FRAME).step(Spots.from_points(UV), SliceInfo(source="a"), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from ctreg_cli.registration.register import (
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.registration.twins import twins, with_twins
 from ctreg_cli.rods import RodModel
-from ctreg_cli.scale import Scale
+from ctreg_cli.scale import Scale, check_scale
 from ctreg_cli.tracking import motion
 from ctreg_cli.tracking.gate import GATE_SD, Outlook, spread
 from ctreg_cli.tracking.lasting import lasting_influence
@@ -180,7 +180,13 @@ class Tracker:
     # --- where it should be ------------------------------------------------------------------------------------------
 
     def predict(self, info: SliceInfo, scale: Scale) -> Prediction | None:
-        """The pose and spots expected in the next slice; None while there is no past to go by."""
+        """The pose and spots expected in the next slice; None while there is no past to go by.
+
+        Raises:
+            MissingScaleError: the scale is None.
+            InputError: the scale is no :class:`Scale`.
+        """
+        check_scale(scale)
         if self._predicted is None or self._predicted[0] is not info or self._predicted[1] != scale:
             self._predicted = (info, scale, self._predict(info, scale))
         return self._predicted[2]
@@ -230,6 +236,10 @@ class Tracker:
             spots: all its spots, px.
             info: what is known of the slice.
             scale: mm per pixel.
+
+        Raises:
+            MissingScaleError: the scale is None.
+            InputError: the scale is no :class:`Scale`.
         """
         prediction = self.predict(info, scale)
         if self._series != info.series:  # another sequence: nothing was lost in it yet
