@@ -91,13 +91,19 @@ class Oracle:
 
     def decidable(self, i: int, settled: list[bool]) -> bool:
         """Whether slice ``i`` is; ``settled`` says of which slices the tracker was sure."""
-        before = None if i == 0 or self.made.truth[i].has_jumped else i - 1
-        while before is not None and not settled[before] and not self.decidable(before, settled):
-            before = None if before == 0 or self.made.truth[before].has_jumped else before - 1
-        key = (i, before)
-        if key not in self.known:
-            self.known[key] = is_decidable(self.made, i, self.sd_px, before)
-        return self.known[key]
+        truth, first = self.made.truth, i
+        while first > 0 and not truth[first].has_jumped and not settled[first - 1]:
+            first -= 1
+        before = None if first == 0 or truth[first].has_jumped else first - 1
+        for between in range(first, i):  # forwards: each rests on the last one before it that is known
+            if self._decidable_after(between, before):
+                before = between
+        return self._decidable_after(i, before)
+
+    def _decidable_after(self, i: int, before: int | None) -> bool:
+        if (i, before) not in self.known:
+            self.known[i, before] = is_decidable(self.made, i, self.sd_px, before)
+        return self.known[i, before]
 
 
 def is_decidable(made: Sequence, i: int, sd_px: float, before: int | None) -> bool:
