@@ -31,8 +31,9 @@ from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.calibrate import calibrate
+from ctreg_cli.registration.doubt import doubt
 from ctreg_cli.registration.labelled import register_labelled
-from ctreg_cli.registration.matching import doubt, search
+from ctreg_cli.registration.matching import search
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.registration.twins import with_twins

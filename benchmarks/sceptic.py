@@ -23,7 +23,8 @@ from benchmarks.accuracy import WRONG_SD, at_arm, model_of
 from ctreg_cli.geometry.pose import make_pose
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model, shipped_frames
-from ctreg_cli.registration.matching import doubt, search, weigh
+from ctreg_cli.registration.doubt import doubt
+from ctreg_cli.registration.matching import search, weigh
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import least_matches, make_scene, register
 from ctreg_cli.registration.result import Registration

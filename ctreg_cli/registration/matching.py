@@ -1,16 +1,14 @@
 """Which spot is which rod, without labels: hypothesise, predict, bound λ, verify.
 
 1. *Hypothesise.* Rod triples, ordered so that a short prefix contains a triple of any large set of rods, against
-ordered
-   spot triples whose distances the bounded rods can show; :func:`~ctreg_cli.registration.minimal.scan_three` gives
-   poses.
+   ordered spot triples whose distances the bounded rods can show;
+   :func:`~ctreg_cli.registration.minimal.scan_three` gives poses.
 2. *Predict.* Each pose says where every other rod crosses the slice, and how well it knows (the covariance of the three
    spots, propagated); the nearest spot votes if it lies within that gate.
 3. *Verify.* The best-voted poses are refined on all their spots, vote again with the smaller covariance, and are ranked
    by their odds against chance (:mod:`~ctreg_cli.registration.evidence`).
-4. *Doubt.* The winners are taken apart: one match dropped, added or swapped at a time; restarted from every root of the
-   triples of their own matches (the same matches can have a second minimum far away); and the search is run
-   again on the winners' own spots for another labelling.
+
+What else explains the spots is then asked in :mod:`~ctreg_cli.registration.doubt`.
 """
 
 from __future__ import annotations
@@ -37,7 +35,6 @@ from ctreg_cli.registration.refine import (
     Observations,
     covariance_from_information,
     invert_2x2,
-    linearise,
     refine,
 )
 from ctreg_cli.rods import RodModel
@@ -45,7 +42,7 @@ from ctreg_cli.rods import RodModel
 #: a vote must lie within this Mahalanobis distance² of the prediction (two degrees of freedom: 1 in 30,000 lost)
 _GATE2 = 20.0
 #: gates never grow beyond this share of the frame's size: a pose that predicts nothing is no hypothesis
-_WIDEST_GATE = 0.2
+WIDEST_GATE = 0.2
 #: and no noise carries a spot farther beyond the end of its rod than this share of the rod's length
 MOST_BEYOND_END = 0.5
 #: matches up to which nothing checks the fit but the odds
@@ -71,21 +68,9 @@ _KEEP_WITHIN = 12.0
 _RIVALS_WITHIN = 6.0
 #: a second frame is looked for that leaves at most so many spots fewer than the first
 _SECOND_FRAME_LACKS = 2
-#: matches within this many nats of the best are taken apart
-_DOUBT_WITHIN = 7.0
-#: how often doubt may find a better match and take that apart in turn
-_BETTER_FOUND = 2
 #: voted hypotheses looked at for a vote that spoils them, the score they need (ln odds, roughly), and the χ²
 #: probability under which one does
 _REPAIRED, _WORTH_REPAIR, _SPOILT_P = 12, 4.0, 1e-4
-#: rod triples of a match whose roots it is refined from anew, to find its second minima
-_RESTARTS = 20
-#: ... and half of them do for so many matches
-_MANY_MATCHES = 8
-#: starts that are refined, and minima that are weighed
-_MOST_STARTS, _MOST_MINIMA = 48, 8
-#: variants that promise a χ² so much above the best are not refined: hundreds of nats, and they take the most steps
-_HOPELESS_CHI2 = 1e3
 #: steps of the refinements before the spots vote again; three noisy spots can start a pose 30° off
 _VERIFY_STEPS = (12, 6)
 #: share of a determinant that rounding can feign
@@ -477,7 +462,7 @@ def _vote(
     others = np.nonzero(~mine)[1].reshape(len(T), n - 3)
     row = np.arange(len(T))[:, None]
     nearest, distance = _nearest_spots(scene.xy_mm, projection.xy_mm[row, others], spots)
-    hopeful = seen[row, others] & (distance < math.sqrt(_GATE2) * _WIDEST_GATE * size)
+    hopeful = seen[row, others] & (distance < math.sqrt(_GATE2) * WIDEST_GATE * size)
     could &= hopeful.sum(axis=1) + 3 >= least_matches - 1
     T, spots, nearest, hopeful, rods, others = (x[could] for x in (T, spots, nearest, hopeful, rods, others))
     b, row = len(T), np.arange(len(T))[:, None]
@@ -507,7 +492,7 @@ def _vote(
         + gate[..., 0, 0] * r[..., 1] ** 2
     ) / det
     spread = np.sqrt(det)
-    votes = hopeful & known & (distance2 < _GATE2) & (spread < (_WIDEST_GATE * size) ** 2)
+    votes = hopeful & known & (distance2 < _GATE2) & (spread < (WIDEST_GATE * size) ** 2)
     density = len(scene.xy_mm) / max(float(np.prod(np.ptp(scene.xy_mm, axis=0))), 1e-9)
     gain = math.log(P_SEEN) - np.log(2 * math.pi * spread * density) - 0.5 * distance2
     missed = math.log(1 - P_SEEN) * expected[could][row, others]
@@ -690,7 +675,7 @@ def nearest_assignment(model: RodModel, scene: Scene, T: FloatArray, covariance:
     gate = J @ C[:, None] @ np.swapaxes(J, -1, -2) + tolerance
     xy = np.nan_to_num(projection.xy_mm, nan=1e9)
     r = scene.xy_mm[None, None] - xy[:, :, None]  # (b, n, m, 2)
-    near = (np.abs(r) < 2 * _WIDEST_GATE * model.size_mm).all(axis=-1) & may[..., None]
+    near = (np.abs(r) < 2 * WIDEST_GATE * model.size_mm).all(axis=-1) & may[..., None]
     b, rod, spot = np.nonzero(near)
     inverse = invert_2x2(gate[b, rod] + scene.covariance_mm[spot])
     d = r[b, rod, spot]
@@ -753,76 +738,6 @@ def _same(model: RodModel, T_a: FloatArray, T_b: FloatArray) -> bool:
     return turn < 1e-3 and shift < 1e-3 * model.size_mm
 
 
-# --- doubt ----------------------------------------------------------------------------------------------------------
-
-
-def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int = 4, most: int = 4) -> Matches:
-    """Look for what else explains the spots: other minima of the same matches, and matches that differ in one spot."""
-    pool = [matches]
-    taken: set[bytes] = set()
-
-    def take_apart(found: Matches, row: int) -> None:
-        taken.add(found.spot_of_rod[row].tobytes())
-        for look in (_restart, _vary):
-            part = look(model, scene, found, row, least_matches)
-            if part is not None:
-                pool.append(part)
-
-    for row in range(len(matches)):
-        if matches.spot_of_rod[row].tobytes() in taken:
-            continue
-        if len(taken) >= most or matches.log_odds[row] < matches.log_odds[0] - _DOUBT_WITHIN:
-            break
-        take_apart(matches, row)
-    all_found = distinct(model, join(pool))
-    for _ in range(_BETTER_FOUND):
-        if all_found.spot_of_rod[0].tobytes() in taken:
-            break
-        # a better match than the search's own has had no doubt cast on it yet
-        take_apart(all_found, 0)
-        all_found = distinct(model, join(pool))
-    return all_found
-
-
-def roots_of_triples(model: RodModel, scene: Scene, spot_of_rod: IntArray, triples: IntArray) -> FloatArray:
-    """(s, 4, 4) poses that three of a match's spots allow, for each of its ``triples`` of rods (t, 3)."""
-    noise = noise_mm(model, scene)
-    T, _ = solve_three(
-        RodTriples.of(model, triples),
-        scene.xy_mm[spot_of_rod[triples]],
-        slack_mm=3 * noise + 2 * scene.half_slab_mm,
-        noise_mm=noise,
-    )
-    return T[scene.prior.allows(T[:, :3, :3])]
-
-
-def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
-    """The same matches, refined from every root of their triples; and what all spots say of the minima found."""
-    spot_of_rod = matches.spot_of_rod[row]
-    matched = np.nonzero(spot_of_rod >= 0)[0]
-    triples = np.array(list(itertools.combinations(matched, 3)), dtype=np.intp)
-    most = _RESTARTS if len(matched) < _MANY_MATCHES else _RESTARTS // 2
-    if len(triples) > most:  # many matches: twins are rare, and each of them shows in most triples
-        triples = triples[:: len(triples) // most + 1]
-    T = roots_of_triples(model, scene, spot_of_rod, triples)
-    if len(T) == 0:
-        return None
-    same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
-    # far starts say so at once; the others go on until those of one minimum lie together: on the way down a valley,
-    # a start that will end in a minimum of its own can still be the worse one
-    for kept, iterations in ((_MOST_STARTS, 2), (_MOST_STARTS, 6), (_MOST_MINIMA, 16)):
-        T, fit, _ = refine(model, T, observations(scene, same[: len(T)]), iterations=iterations, step_tolerance=1e-3)
-        order = np.argsort(fit.chi2, kind="stable")
-        order = order[distinct_poses(model, T[order])[:kept]]
-        T, fit = T[order], fit.subset(order)
-    hopeful = fit.chi2 < fit.chi2[0] + _HOPELESS_CHI2
-    # what speaks for another minimum is often a spot that the first one could not use: all vote again
-    same, again = same[: len(T)], assign(model, scene, T, fit)
-    other = (again != same).any(axis=1)
-    T, spot_of_rod = np.concatenate([T[hopeful], T[other]]), np.concatenate([same[hopeful], again[other]])
-    return weigh(model, scene, T, spot_of_rod, least_matches)
-
-
 def distinct_poses(model: RodModel, T: FloatArray, group: IntArray | None = None) -> IntArray:
     """Indices of poses (b, 4, 4) that differ by half a degree or a fiftieth of the frame, first come first.
 
@@ -840,55 +755,13 @@ def distinct_poses(model: RodModel, T: FloatArray, group: IntArray | None = None
     return np.array(kept, dtype=np.intp)
 
 
-def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
-    """One match dropped, one free spot added, or one match exchanged, each refined anew."""
-    T, spot_of_rod = matches.T[row], matches.spot_of_rod[row]
-    matched = np.nonzero(spot_of_rod >= 0)[0]
-    starts, variants = [], []
-    without = np.repeat(spot_of_rod[None], len(matched), axis=0)
-    without[np.arange(len(matched)), matched] = -1
-    if len(matched) - 1 >= 3:
-        T_without, fit, _ = refine(
-            model,
-            np.repeat(T[None], len(matched), axis=0),
-            observations(scene, without),
-            iterations=5,
-            step_tolerance=1e-4,
-        )
-        variants.append(without)
-        starts.append(T_without)
-        again = assign(model, scene, T_without, fit)
-        variants.append(again)
-        starts.append(T_without)
-        # the spot just dropped, exchanged for the next nearest free one
-        used = np.zeros((len(matched), len(scene.xy_mm)), dtype=bool)
-        for i in range(len(matched)):
-            used[i, without[i][without[i] >= 0]] = True
-            used[i, spot_of_rod[matched[i]]] = True
-        xy = fit.predicted_px[np.arange(len(matched)), matched]
-        gap = np.linalg.norm(scene.xy_mm[None] - xy[:, None], axis=-1)
-        gap[used] = np.inf
-        swap = without.copy()
-        near = gap.min(axis=1, initial=np.inf) < _WIDEST_GATE * model.size_mm
-        swap[np.arange(len(matched)), matched] = gap.argmin(axis=1)
-        variants.append(swap[near])
-        starts.append(T_without[near])
-        # the spot just dropped, given to another rod that crosses beside it (an upright and a diagonal where they meet)
-        crossing = np.nan_to_num(fit.predicted_px, nan=np.inf)
-        beside = np.linalg.norm(crossing - scene.xy_mm[spot_of_rod[matched]][:, None], axis=-1)
-        beside = np.where(without < 0, beside, np.inf)
-        beside[np.arange(len(matched)), matched] = np.inf
-        which, other = np.nonzero(beside < _WIDEST_GATE * model.size_mm)
-        if len(which):
-            relabelled = without[which]
-            relabelled[np.arange(len(which)), other] = spot_of_rod[matched[which]]
-            variants.append(relabelled)
-            starts.append(T_without[which])
-    variants_all = np.concatenate(variants) if variants else np.empty((0, len(model)), dtype=np.intp)
-    starts_all = np.concatenate(starts) if starts else np.empty((0, 4, 4))
-    _, first = np.unique(np.concatenate([spot_of_rod[None], variants_all]), axis=0, return_index=True)
-    new = np.sort(first[first > 0]) - 1
-    starts_all, variants_all = starts_all[new], variants_all[new]
-    promised = linearise(model, starts_all, observations(scene, variants_all)).promised_chi2(model.size_mm)
-    hopeful = promised < matches.fit.chi2[row] + _HOPELESS_CHI2
-    return weigh(model, scene, starts_all[hopeful], variants_all[hopeful], least_matches)
+def roots_of_triples(model: RodModel, scene: Scene, spot_of_rod: IntArray, triples: IntArray) -> FloatArray:
+    """(s, 4, 4) poses that three of a match's spots allow, for each of its ``triples`` of rods (t, 3)."""
+    noise = noise_mm(model, scene)
+    T, _ = solve_three(
+        RodTriples.of(model, triples),
+        scene.xy_mm[spot_of_rod[triples]],
+        slack_mm=3 * noise + 2 * scene.half_slab_mm,
+        noise_mm=noise,
+    )
+    return T[scene.prior.allows(T[:, :3, :3])]

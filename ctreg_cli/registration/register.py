@@ -13,12 +13,13 @@ from scipy.special import chdtrc
 from ctreg_cli.arrays import FloatArray, IntArray, frozen, frozen_index
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.doubt import doubt
 from ctreg_cli.registration.elsewhere import solutions_without_a_spot
 from ctreg_cli.registration.evidence import PosePrior
 from ctreg_cli.registration.integrity import LEAST_MATCHES as LEAST_PROTECTED
 from ctreg_cli.registration.integrity import protection_levels, risk_of_each
 from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley, covariance_along_the_valley, positive_part
-from ctreg_cli.registration.matching import Matches, Scene, doubt, is_second_frame, observations, search
+from ctreg_cli.registration.matching import Matches, Scene, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.other_scale import LOOSE_SHARE, log_odds_of_other_scale, loose_matches

@@ -22,8 +22,9 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.doubt import doubt
 from ctreg_cli.registration.linearity import positive_part
-from ctreg_cli.registration.matching import Matches, Scene, distinct, doubt, join, observations, search, weigh
+from ctreg_cli.registration.matching import Matches, Scene, distinct, join, observations, search, weigh
 from ctreg_cli.registration.misfit import covariance_with_misfit
 from ctreg_cli.registration.options import TrackingOptions
 from ctreg_cli.registration.refine import Observations, covariance_from_information

@@ -9,8 +9,9 @@ import pytest
 
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
+from ctreg_cli.registration.doubt import doubt
 from ctreg_cli.registration.labelled import register_labelled
-from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, doubt, plan, search, visibility, weigh
+from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, plan, search, visibility, weigh
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
