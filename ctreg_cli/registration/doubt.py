@@ -1,7 +1,8 @@
 """What else explains the spots: the winners of the search, taken apart.
 
 One match is dropped, added or exchanged at a time, and a match is refined anew from every root of the triples of its
-own spots: the same matches can have a second minimum far away.
+own spots: the same matches can have a second minimum far away. One false spot among right ones can hold a match in the
+wrong one of two minima; so those of the match without each of its spots are found as well, and all spots vote there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import itertools
 
 import numpy as np
 
+from ctreg_cli.registration.elsewhere import solutions_without_a_spot
 from ctreg_cli.registration.matching import (
     WIDEST_GATE,
     Matches,
@@ -29,6 +31,11 @@ from ctreg_cli.rods import RodModel
 _DOUBT_WITHIN = 7.0
 #: how often doubt may find a better match and take that apart in turn
 _BETTER_FOUND = 2
+#: a match of fewer spots has too many minima without one of them, and the search finds what they could lead to
+_LEAST_WITHOUT = 6
+#: minima without a spot that are less probable than this beside the known one are not voted on: a spot gained there is
+#: worth some ten nats
+_NEGLECTED_P = 1e-6
 #: variants that promise a χ² so much above the best are not refined: hundreds of nats, and they take the most steps
 _HOPELESS_CHI2 = 1e3
 #: rod triples of a match whose roots it is refined from anew, to find its second minima
@@ -46,7 +53,7 @@ def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int
 
     def take_apart(found: Matches, row: int) -> None:
         taken.add(found.spot_of_rod[row].tobytes())
-        for look in (_restart, _vary):
+        for look in (_restart, _vary, _without_each):
             part = look(model, scene, found, row, least_matches)
             if part is not None:
                 pool.append(part)
@@ -146,3 +153,21 @@ def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_match
     promised = linearise(model, starts_all, observations(scene, variants_all)).promised_chi2(model.size_mm)
     hopeful = promised < matches.fit.chi2[row] + _HOPELESS_CHI2
     return weigh(model, scene, starts_all[hopeful], variants_all[hopeful], least_matches)
+
+
+def _without_each(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:
+    """What all spots say of the other minima of a match without each of its spots.
+
+    Only where a rod is missed and a spot left over: without these nothing can be gained for the spot given up.
+    """
+    spot_of_rod = matches.spot_of_rod[row]
+    matched = spot_of_rod >= 0
+    n = int(matched.sum())
+    if n < _LEAST_WITHOUT or n == len(scene.xy_mm) or not (matches.expected[row] & ~matched).any():
+        return None
+    T, without = solutions_without_a_spot(model, scene, matches.T[row], spot_of_rod, neglected_p=_NEGLECTED_P)
+    T, without = T[n:], without[n:]  # the first n are next to the pose that is known
+    if len(T) == 0:
+        return None
+    again = assign(model, scene, T, linearise(model, T, observations(scene, without)))
+    return weigh(model, scene, T, again, least_matches)

@@ -9,9 +9,7 @@ import pytest
 
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.doubt import doubt
-from ctreg_cli.registration.labelled import register_labelled
-from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, plan, search, visibility, weigh
+from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, plan, search, visibility
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
@@ -102,53 +100,6 @@ def test_few_spots_are_looked_at_from_every_triple(seed: int) -> None:
     model = model_of(frame)
     scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, HALF_MM, options=RegistrationOptions())
     assert search(model, scene, least_matches=5) is not None, seed
-
-
-@pytest.mark.parametrize("seed", [134, 140, *range(10)])
-def test_every_minimum_of_the_true_match_is_found(seed: int) -> None:
-    """The labelled solver starts elsewhere; what it ends in, doubt must know of (the first two have two minima)."""
-    rng = np.random.default_rng([861, seed])
-    frame = random_frame(rng, 5 + seed % 2)
-    world = some_scene(rng, frame, sd_px=0.3, least=5)
-    model, spots = model_of(frame), Spots.from_points(world.uv_px, 0.3)
-    minima = register_labelled(spots, world.rod_of_spot, model, scale=HALF_MM)
-    scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
-    found = search(model, scene, least_matches=4)
-    assert found is not None, seed
-    found = doubt(model, scene, found, least_matches=4)
-    true = np.full(len(model), -1)
-    true[world.rod_of_spot] = np.arange(len(spots))
-    same = [T for T, match in zip(found.T, found.spot_of_rod, strict=True) if (match == true).all()]
-    for minimum in (m for m in minima if m.chi2 < minima[0].chi2 + 9):
-        turns = [poses.rotation_angle(T[:3, :3] @ minimum.T_slice_model[:3, :3].T) for T in same]
-        assert min(turns) < np.radians(2), seed
-
-
-@pytest.mark.parametrize("seed", [0, 3, 4, 19, 23])
-def test_doubt_leads_from_a_poor_minimum_to_the_true_match(seed: int) -> None:
-    """One true match short, these scenes have a second minimum, where the spot left over fits no rod."""
-    rng = np.random.default_rng([867, seed])
-    frame = random_frame(rng, 6)
-    world = some_scene(rng, frame, sd_px=0.3, least=6)
-    model, spots = model_of(frame), Spots.from_points(world.uv_px, 0.3)
-    short = np.array(world.rod_of_spot)
-    short[0] = -1
-    minima = register_labelled(spots, short, model, scale=HALF_MM)
-    turned = [m for m in minima if poses.rotation_angle(m.T_slice_model[:3, :3] @ world.R.T) > np.radians(15)]
-    scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
-    true = np.full((1, len(model)), -1)
-    true[0, world.rod_of_spot] = np.arange(len(spots))
-    less = np.where(true == 0, -1, true)
-    poor = weigh(model, scene, turned[0].T_slice_model[None], less, 4)
-    full = weigh(model, scene, poses.make_pose(world.R, world.t)[None], true, 4)
-    assert poor is not None
-    assert full is not None
-    assert full.log_odds[0] > poor.log_odds[0] + 4
-    found = doubt(model, scene, poor, least_matches=4)
-    assert found.log_odds[0] > full.log_odds[0] - 1e-3
-    # and doubt has been cast on it in turn: the match short of a spot, at the pose of the full one, is there too
-    near = [poses.rotation_angle(T[:3, :3] @ found.T[0, :3, :3].T) < np.radians(5) for T in found.T[1:]]
-    assert any(near), seed
 
 
 def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
