@@ -56,6 +56,8 @@ BEYOND_CHANCE = math.log(1e9)
 _BEYOND_CHANCE_OF_ALL = math.log(1e7)
 #: ln odds below which no match is believed; up to so many spots, all rod triples are then tried
 _BELIEVABLE, _FEW_SPOTS = math.log(100), 12
+#: ... and while so few spot triples are left, whatever was found: of six spots another story may be as good
+_AFFORDED = 6_000
 #: hypotheses a stage hands on to refinement
 _KEEP_PER_STAGE = 40
 #: ... and one that only asks whether a match beyond chance has a rival
@@ -285,11 +287,13 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
                 best = part.subset(np.array([0]))
                 if _is_beyond_chance(best, m):
                     start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
-    if m <= _FEW_SPOTS and done < len(layout.triples) and (best is None or best.log_odds[0] < _BELIEVABLE):
+    if done < len(layout.triples) and _all_triples_are_worth_it(best, len(layout.triples) - done, m):
         # noise can take every root from each of the few triples that hold the rods seen: here all can be afforded
         part = _search_triples(model, scene, layout.triples[done:], start_from, least_matches, seen)
         if part is not None:
             found.append(part)
+            if best is None or part.log_odds[0] > best.log_odds[0]:
+                best = part.subset(np.array([0]))
     if best is not None and best.log_odds[0] > BEYOND_CHANCE:
         second = _second_frame(model, scene, best, least_matches)
         if second is not None:
@@ -297,6 +301,14 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
     if not found:
         return None
     return distinct(model, join(found))
+
+
+def _all_triples_are_worth_it(best: Matches | None, n_triples: int, n_spots: int) -> bool:
+    """Whether to try the rest of the rod triples: where nothing believable was found, or few spots make it cheap."""
+    if best is None or best.log_odds[0] < _BELIEVABLE:
+        return n_spots <= _FEW_SPOTS
+    cheap = n_triples * n_spots * (n_spots - 1) * (n_spots - 2) <= _AFFORDED
+    return bool(best.log_odds[0] < BEYOND_CHANCE) and cheap
 
 
 def _is_beyond_chance(best: Matches, n_spots: int) -> bool:

@@ -102,6 +102,21 @@ def test_few_spots_are_looked_at_from_every_triple(seed: int) -> None:
     assert search(model, scene, least_matches=5) is not None, seed
 
 
+@pytest.mark.parametrize("seed", [460, *range(4)])
+def test_the_truth_is_found_in_five_spots_whatever_else_is(seed: int) -> None:
+    """In the first, another match of the five comes near it, and noise takes its roots from the first triples."""
+    rng = np.random.default_rng([869, seed])
+    frame = random_frame(rng, 9)
+    world = some_scene(rng, frame, sd_px=0.05, missing=4, least=5)
+    model = model_of(frame)
+    scene = make_scene(Spots.from_points(world.uv_px, 0.05), model, HALF_MM, options=RegistrationOptions())
+    true = np.full(len(model), -1)
+    true[world.rod_of_spot] = np.arange(len(world.uv_px))
+    found = search(model, scene, least_matches=5)
+    assert found is not None, seed
+    assert (found.spot_of_rod == true).all(axis=1).any(), seed
+
+
 def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
     rng = np.random.default_rng(866)
     frame = random_frame(rng, 7)
