@@ -47,7 +47,21 @@ _MOST_STARTS, _MOST_MINIMA = 48, 8
 
 
 def doubt(model: RodModel, scene: Scene, matches: Matches, *, least_matches: int = 4, most: int = 4) -> Matches:
-    """Look for what else explains the spots: other minima of the same matches, and matches that differ in one spot."""
+    """Look for what else explains the spots.
+
+    Other minima of the same matches, matches that differ in one spot, and what all spots make of the other minima of
+    the matches without each of their spots. A better match found that way is taken apart in turn.
+
+    Args:
+        model: the rods.
+        scene: the spots, and what bears on the pose.
+        matches: what the search found, best first.
+        least_matches: as for the search.
+        most: how many of them to take apart.
+
+    Returns:
+        These and what was found beside them, best first, one of each pose and match.
+    """
     pool = [matches]
     taken: set[bytes] = set()
 

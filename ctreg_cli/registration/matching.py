@@ -56,7 +56,7 @@ BEYOND_CHANCE = math.log(1e9)
 _BEYOND_CHANCE_OF_ALL = math.log(1e7)
 #: ln odds below which no match is believed; up to so many spots, all rod triples are then tried
 _BELIEVABLE, _FEW_SPOTS = math.log(100), 12
-#: ... and while so few spot triples are left, whatever was found: of six spots another story may be as good
+#: ... and, whatever was found, where so few spot triples are left to try (of five spots): another story may be as good
 _AFFORDED = 6_000
 #: hypotheses a stage hands on to refinement
 _KEEP_PER_STAGE = 40
