@@ -21,7 +21,7 @@ import numpy as np
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.matching import Matches, Scene, distinct_poses, observations, roots_of_triples, weigh
-from ctreg_cli.registration.refine import Linearisation, linearise, refine
+from ctreg_cli.registration.refine import Linearisation, gauss_newton_step, linearise, refine
 from ctreg_cli.rods import RodModel
 
 #: rod triples whose roots are the starts: each minimum is reached from a third of them
@@ -120,9 +120,7 @@ def _steps_without(model: RodModel, fit: Linearisation, matched: IntArray) -> tu
     b, k = chi2.shape
     others = 1 - np.eye(k)  # not the sum of all less its own: rods nearly in the slice have Jacobians beyond all bounds
     H, g, chi2 = (others @ H.reshape(b, k, 36)).reshape(H.shape), others @ g, chi2 @ others
-    diagonal = np.einsum("bkii->bki", H)
-    diagonal += 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-300
-    step = np.linalg.solve(H, g[..., None])[..., 0]
+    step = gauss_newton_step(H, g)
     promised = chi2 - (step * g).sum(axis=-1)
     step *= unit
     turn = np.linalg.norm(step[..., 3:], axis=-1, keepdims=True)

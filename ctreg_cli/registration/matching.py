@@ -283,17 +283,15 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
             if part is None:
                 continue
             found.append(part)
-            if best is None or part.log_odds[0] > best.log_odds[0]:
-                best = part.subset(np.array([0]))
-                if _is_beyond_chance(best, m):
-                    start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
+            best = _better(best, part)
+            if _is_beyond_chance(best, m):
+                start_from = best.spot_of_rod[0][best.spot_of_rod[0] >= 0]
     if done < len(layout.triples) and _all_triples_are_worth_it(best, len(layout.triples) - done, m):
         # noise can take every root from each of the few triples that hold the rods seen: here all can be afforded
         part = _search_triples(model, scene, layout.triples[done:], start_from, least_matches, seen)
         if part is not None:
             found.append(part)
-            if best is None or part.log_odds[0] > best.log_odds[0]:
-                best = part.subset(np.array([0]))
+            best = _better(best, part)
     if best is not None and best.log_odds[0] > BEYOND_CHANCE:
         second = _second_frame(model, scene, best, least_matches)
         if second is not None:
@@ -301,6 +299,11 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
     if not found:
         return None
     return distinct(model, join(found))
+
+
+def _better(best: Matches | None, part: Matches) -> Matches:
+    """The better of the best so far and the first of ``part``."""
+    return part.subset(np.array([0])) if best is None or part.log_odds[0] > best.log_odds[0] else best
 
 
 def _all_triples_are_worth_it(best: Matches | None, n_triples: int, n_spots: int) -> bool:

@@ -316,13 +316,12 @@ def _polish(
     y_i, y_j = y[i], y[j]
     size2 = float(triples.lengths.max()) ** 2
     lam, wanted = np.array(lambdas.T, order="C"), np.ascontiguousarray(distance.T)
-    error = np.full(lam.shape[1], np.inf)
+    f = np.full(lam.shape, np.inf)
     for _ in range(steps):
         P = p + lam[:, None] * y
         gap = P[i] - P[j]  # (3 sides, 3 axes, r)
         length = np.maximum(np.sqrt(_along(gap, gap)), 1e-12)
         f = length - wanted
-        error = np.abs(f).max(axis=0)
         a = _along(gap, y_i) / length  # ∂f/∂λ_i
         b = -_along(gap, y_j) / length  # ∂f/∂λ_j
         # rows: (a0, b0, 0), (a1, 0, b1), (0, a2, b2); normal equations with a little damping, solved in closed form
@@ -339,7 +338,8 @@ def _polish(
         lam[2] -= (c02 * g0 + c12 * g1 + c22 * g2) / det
     P = p + lam[:, None] * y
     gap = P[i] - P[j]
-    return np.ascontiguousarray(lam.T), np.minimum(error, np.abs(np.sqrt(_along(gap, gap)) - wanted).max(axis=0))
+    error = np.minimum(np.abs(f).max(axis=0), np.abs(np.sqrt(_along(gap, gap)) - wanted).max(axis=0))
+    return np.ascontiguousarray(lam.T), error
 
 
 def _along(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -90,11 +90,19 @@ class Linearisation:
         """The χ² (b,) that one Gauss–Newton step would leave if the spots moved in straight lines."""
         H, g = self.normal_equations()
         unit = np.array([1, 1, 1, *(3 * [1 / size_mm])])
-        H, g = H * (unit[:, None] * unit), g * unit
-        diagonal = H.reshape(-1, 36)[:, ::7]  # a view
-        diagonal += 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-300
-        promised: FloatArray = self.chi2 - (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1)
+        g *= unit
+        promised: FloatArray = self.chi2 - (g * gauss_newton_step(H * (unit[:, None] * unit), g)).sum(axis=1)
         return promised
+
+
+def gauss_newton_step(H: FloatArray, g: FloatArray) -> FloatArray:
+    """Steps (..., 6) of information ``H`` (..., 6, 6) and gradients (..., 6), rotation measured in frame sizes.
+
+    ``H`` is damped in place by a billionth, so that what the spots say nothing of stays where it is.
+    """
+    diagonal = np.einsum("...ii->...i", H)  # a view
+    diagonal += 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-300
+    return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
 
 
 def invert_2x2(matrices: FloatArray) -> FloatArray:
