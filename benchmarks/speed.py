@@ -89,7 +89,7 @@ def time_stages(files: list[Path], model: RodModel, repeats: int) -> Stages:
                     t0 = clock()
                     pydicom.dcmread(file).pixel_array  # noqa: B018
                     t1 = clock()
-                    slice_ = record.load()
+                    slice_ = record.open()
                     t2 = clock()
                     result = pipeline.track_slice(i, slice_, tracker, follower, scale=None)
                     t3 = clock()

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, frozen
-from ctreg_cli.errors import MissingScaleError
+from ctreg_cli.errors import MissingScaleError, UnreadableSliceError
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.follow import Follower
 from ctreg_cli.imaging.segmentation import SegmentationOptions, find_spots
@@ -92,7 +92,10 @@ def spots_of(slice_: SliceLike, options: SegmentationOptions) -> SpotSlice:
         case UnreadableSlice():
             return SpotSlice(info=slice_.info, spots=no_spots(), problem=slice_.problem)
         case Slice():
-            return SpotSlice(info=slice_.info, spots=find_spots(slice_, options))
+            try:
+                return SpotSlice(info=slice_.info, spots=find_spots(slice_, options))
+            except UnreadableSliceError as error:  # its file was taken away or cut short a moment ago
+                return SpotSlice(info=slice_.info, spots=no_spots(), problem=str(error))
 
 
 def expecting(model: RodModel, segmentation: SegmentationOptions | None) -> SegmentationOptions:
@@ -234,17 +237,13 @@ def track_slice(
 ) -> FrameResult:
     """The next slice of a sequence; ``tracker`` and ``follower`` are the sequence's own."""
     if isinstance(slice_, Slice):
-        override = scale or slice_.info.scale
-        prediction = None if override is None else tracker.predict(slice_.info, override)
-        if override is not None and prediction is not None:
-            rods = np.flatnonzero(prediction.visible & _inside(prediction.spots_px, slice_.info.shape))
-            spots = follower.measure(
-                slice_, rods, prediction.spots_px.take(rods, axis=0), prediction.radius_px.take(rods)
-            )
-            tracked = tracker.follow(spots, slice_.info, override)
-            if tracked is not None:
-                item = SpotSlice(info=slice_.info, spots=spots)
-                return _tracked_result(place, item, tracker, tracked)
+        try:
+            followed = _followed(place, slice_, tracker, follower, scale)
+        except UnreadableSliceError as error:
+            slice_ = UnreadableSlice(info=slice_.info, problem=str(error))
+        else:
+            if followed is not None:
+                return followed
     follower.forget()
     item = spots_of(slice_, follower.options)
     used = scale or item.info.scale
@@ -254,6 +253,24 @@ def track_slice(
         return failure(place if item.index is None else item.index, item, reason)
     tracked = tracker.step(item.spots, item.info, used)
     return _tracked_result(place, item, tracker, tracked)
+
+
+def _followed(
+    place: int, slice_: Slice, tracker: Tracker, follower: Follower, scale: Scale | None
+) -> FrameResult | None:
+    """The result of the windows about the predicted spots alone, if nothing is in doubt; else None.
+
+    Raises:
+        UnreadableSliceError: the slice's file was taken away or cut short a moment ago.
+    """
+    used, info = scale or slice_.info.scale, slice_.info
+    prediction = None if used is None else tracker.predict(info, used)
+    if used is None or prediction is None:
+        return None
+    rods = np.flatnonzero(prediction.visible & _inside(prediction.spots_px, info.shape))
+    spots = follower.measure(slice_, rods, prediction.spots_px.take(rods, axis=0), prediction.radius_px.take(rods))
+    tracked = tracker.follow(spots, info, used)
+    return None if tracked is None else _tracked_result(place, SpotSlice(info=info, spots=spots), tracker, tracked)
 
 
 def smoothed(results: Sequence[FrameResult], model: RodModel, *, scale: Scale | None = None) -> list[FrameResult]:

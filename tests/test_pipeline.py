@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ctreg_cli.errors import MissingScaleError
 from ctreg_cli.imaging.segmentation import SegmentationOptions
+from ctreg_cli.imaging.slice import Slice, UnreadableSlice
 from ctreg_cli.imaging.spot_slice import SpotSlice
-from ctreg_cli.io.images import read_slices
+from ctreg_cli.io.dicom_pixels import NativePixels
+from ctreg_cli.io.images import open_images, read_slices
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.pipeline import FrameResult, pose, pose_joint, segment, track
 
@@ -74,3 +77,41 @@ def test_a_series_without_scale_does_not_end_the_other(seen: list[SpotSlice]) ->
     assert rows[1].best is not None
     with pytest.raises(MissingScaleError):
         list(pose_joint(other, FRAME))
+
+
+def test_a_frame_that_is_followed_is_found_in_some_rows_of_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = sorted((SAMPLES / "track").glob("*.dcm"))
+    expected = list(track(read_slices(*paths), FRAME))
+    read: list[str] = []
+    whole = NativePixels.whole
+    monkeypatch.setattr(NativePixels, "whole", lambda pixels: read.append(pixels.path) or whole(pixels))
+    results = list(track(open_images(paths), FRAME))
+    assert len(set(read)) < len(paths) / 2
+    for result, other in zip(results, expected, strict=True):
+        assert (result.status, result.method) == (other.status, other.method)
+        np.testing.assert_allclose(result.spots.uv_px, other.spots.uv_px, rtol=0, atol=1e-9)
+        assert result.best is not None
+        assert other.best is not None
+        np.testing.assert_allclose(result.best.T_slice_model, other.best.T_slice_model, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(result.best.covariance, other.best.covariance, rtol=1e-6)
+
+
+@METHODS
+@pytest.mark.parametrize("harm", ["cut short", "taken away"])
+def test_a_file_harmed_after_it_was_opened_is_a_row(method: Method, harm: str, tmp_path: Path) -> None:
+    """Its size was looked at when it was opened, its pixels are wanted a moment later."""
+    for path in sorted((SAMPLES / "track").glob("*.dcm"))[:6]:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    def opened() -> Iterator[Slice | UnreadableSlice]:
+        for number, slice_ in enumerate(open_images([tmp_path])):
+            if number == 3:
+                path = tmp_path / slice_.info.source
+                path.write_bytes(path.read_bytes()[:2000])
+                if harm == "taken away":
+                    path.unlink()
+            yield slice_
+
+    results = list(method(opened(), FRAME))
+    assert [result.status for result in results] == [*3 * ["ok"], "no_pose", "ok", "ok"]
+    assert results[3].reason == "unreadable"

@@ -52,6 +52,9 @@ from ctreg_cli.imaging.window import UprightImage, disc, grid
 
 #: radius of the windows, px: the least of those that the search tries
 RADIUS_PX = 8
+#: rows beyond where spots are looked for that are read with them: a window about a spot at the edge, twice, in case it
+#: has to be moved there
+ROWS_BEYOND = 3 * RADIUS_PX
 #: a spot no farther from the middle of its window than this, px along u and v, is seen as well as one in the middle
 MAX_OFF_MIDDLE_PX = 1.0
 #: steps at most; the last must have moved the contours by less than this (in half widths) and changed height, shape and
@@ -124,19 +127,22 @@ class Follower:
         """
         known, self._known = self._known, None  # what is not found again is not known any more
         self._age += 1
-        if known is None or self._age > MAX_AGE or not _is_plain(slice_, self.options):
+        if known is None or self._age > MAX_AGE or self.options.polarity == "auto":
             return self._measured_in_full(slice_, rods, uv_px, radius_px)
-        if rods.tolist() == known.rods.tolist():
-            seen, found = self._follow(slice_, known, uv_px, radius_px)
+        here = None if rods.tolist() == known.rods.tolist() else np.isin(rods, known.rods)
+        if here is not None and not here.any():
+            return self._measured_in_full(slice_, rods, uv_px, radius_px)
+        windows = _Windows.of(slice_, uv_px[:, 1], radius_px, bright=self.options.polarity == "bright")
+        if windows is None:
+            return self._measured_in_full(slice_, rods, uv_px, radius_px)
+        if here is None:
+            seen, found = self._follow(windows, known, uv_px, radius_px)
             if all(found.tolist()):
                 return seen
             rest = ~found
         else:
-            here = np.isin(rods, known.rods)
-            if not here.any():
-                return self._measured_in_full(slice_, rods, uv_px, radius_px)
             known = known.take(np.isin(known.rods, rods))
-            seen, found = self._follow(slice_, known, uv_px[here], radius_px[here])
+            seen, found = self._follow(windows, known, uv_px[here], radius_px[here])
             rest = ~here
             rest[here] = ~found
         others = self._measured_in_full(slice_, rods[rest], uv_px[rest], radius_px[rest])
@@ -145,7 +151,7 @@ class Follower:
     def _measured_in_full(self, slice_: Slice, rods: IntArray, uv: FloatArray, radius: FloatArray) -> Spots:
         """Spots of rods of which nothing is known; how they look is remembered where one is alone and expected."""
         spots = measure_spots(slice_, uv, radius, self.options)
-        if not len(spots) or not _is_plain(slice_, self.options):
+        if not len(spots) or self.options.polarity == "auto" or not _is_plain(slice_.stored):
             return spots
         if self._known is None:
             self._age = 0
@@ -181,9 +187,8 @@ class Follower:
         self._waits[rod] = waited, waited
         return True
 
-    def _follow(self, slice_: Slice, known: _Known, uv: FloatArray, radius: FloatArray) -> tuple[Spots, BoolArray]:
+    def _follow(self, windows: _Windows, known: _Known, uv: FloatArray, radius: FloatArray) -> tuple[Spots, BoolArray]:
         """Spots of those known rods (k,) that a step from what is known measures, and which rods these are."""
-        windows = _Windows.of(slice_, bright=self.options.polarity == "bright")
         middles, values, brightest, good = windows.about(uv, known)
         region = _Region.of(values > known.half[:, None])
         fitted, shift, close = _stepped(known, region, values, brightest)
@@ -537,12 +542,13 @@ def _formal_variance(parameters: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 class _Windows(NamedTuple):
-    """The pixels of a slice, spots upright; only integers, so that each is a value."""
+    """The pixels of some rows of a slice, spots upright; only integers, so that each is a value."""
 
     source: Slice
     is_bright: bool
-    #: the image in one line
+    #: the rows in one line, the first of them, and their (number, columns)
     stored: NDArray[Any]
+    first_row: int
     shape: tuple[int, int]
     sign: float
     unit: float
@@ -550,7 +556,17 @@ class _Windows(NamedTuple):
     padding: tuple[float, float] | None
 
     @classmethod
-    def of(cls, slice_: Slice, *, bright: bool) -> _Windows:
+    def of(cls, slice_: Slice, v: FloatArray, radius: FloatArray, *, bright: bool) -> _Windows | None:
+        """The rows about places ``v`` (k,) where spots are looked for within ``radius`` (k,), px.
+
+        None where windows of such pixels cannot be taken by one index, or do not mean one thing.
+        """
+        n_rows = slice_.info.shape[0] if slice_.info.shape is not None else len(slice_.stored)
+        around = float(radius.max()) + ROWS_BEYOND
+        first, end = max(int(v.min() - around), 0), min(int(v.max() + around), n_rows)
+        rows = slice_.rows(first, max(first, end))
+        if not _is_plain(rows):
+            return None
         sign = math.copysign(1.0, slice_.slope) * (1.0 if bright else -1.0)
         padding = slice_.padding
         if padding is not None and sign < 0:
@@ -558,8 +574,9 @@ class _Windows(NamedTuple):
         return cls(
             source=slice_,
             is_bright=bright,
-            stored=slice_.stored.reshape(-1),
-            shape=slice_.stored.shape,
+            stored=rows.reshape(-1),
+            first_row=first,
+            shape=rows.shape,
             sign=sign,
             unit=abs(slice_.slope),
             padding=padding,
@@ -623,7 +640,7 @@ class _Windows(NamedTuple):
         ``least``, as :func:`~ctreg_cli.imaging.peaks.rate_peaks` sees it. Next to padding all is a peak.
         """
         rows, columns = self.shape
-        u, v = pixels.T
+        u, v = pixels[:, 0], pixels[:, 1] - self.first_row
         inside = (np.minimum(u, v) >= 3) & (u < columns - 3) & (v < rows - 3)
         around = np.arange(-3, 4)
         at = (v * columns + u)[:, None, None] + around[:, None] * columns + around
@@ -644,13 +661,13 @@ class _Windows(NamedTuple):
     def _inside(self, middles: FloatArray, radius: int) -> BoolArray:
         """Which (k,) windows about ``middles`` (k, 2) lie in the image."""
         rows, columns = self.shape
-        u, v = middles.T
+        u, v = middles[:, 0], middles[:, 1] - self.first_row
         return np.asarray((np.minimum(u, v) >= radius) & (u < columns - radius) & (v < rows - radius))
 
     def _at(self, middles: FloatArray, radius: int) -> FloatArray:
         """Upright values (k, p) on discs about whole pixels (k, 2); beyond the image they mean nothing."""
         columns = self.shape[1]
-        at = (middles[:, 1] * columns + middles[:, 0]).astype(np.intp)
+        at = ((middles[:, 1] - self.first_row) * columns + middles[:, 0]).astype(np.intp)
         values: FloatArray = self.stored.take(at[:, None] + _offsets(radius, columns), mode="clip").astype(np.float64)
         return values if self.sign > 0 else -values
 
@@ -662,15 +679,9 @@ class _Windows(NamedTuple):
         return np.asarray((values >= self.padding[0]) & (values <= self.padding[1]))
 
 
-def _is_plain(slice_: Slice, options: SegmentationOptions) -> bool:
-    """Whether windows of a slice can be taken by one index, and mean one thing."""
-    stored = slice_.stored
-    return (
-        options.polarity != "auto"
-        and stored.dtype.kind in "iu"
-        and stored.flags.c_contiguous
-        and min(stored.shape) > 2 * RADIUS_PX
-    )
+def _is_plain(stored: NDArray[Any]) -> bool:
+    """Whether windows of an image, or of some of its rows, can be taken by one index, and mean one thing."""
+    return stored.dtype.kind in "iu" and stored.flags.c_contiguous and min(stored.shape) > 2 * RADIUS_PX
 
 
 def _near_each_other(centre: FloatArray) -> BoolArray:

@@ -1,14 +1,15 @@
 """A CT slice: stored pixels, and what is known of where and when they were taken.
 
 Pixels stay as the scanner stored them; they become Hounsfield units only in the windows that are looked at
-(:meth:`Slice.values`). A 512 × 512 slice is thresholded ten times faster than it is rescaled.
+(:meth:`Slice.values`). A 512 × 512 slice is thresholded ten times faster than it is rescaled. Those of a file are read
+when they are first looked at (:class:`FileSlice`): a frame that is followed crosses a third of an image's rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,8 +69,11 @@ class Slice:
         if not (isinstance(stored, np.ndarray) and stored.ndim == 2 and stored.size and stored.dtype.kind in "biuf"):
             what = f"{stored.dtype} {stored.shape}" if isinstance(stored, np.ndarray) else type(stored).__name__
             raise InputError(f"stored: {what} is no image; give a (rows, columns) array of real numbers")
-        demand(is_number(self.slope) and self.slope != 0, "slope", self.slope, "a finite number that is not 0")
-        demand(is_number(self.intercept), "intercept", self.intercept, "a finite number")
+        _check_rescale(self.slope, self.intercept)
+
+    def rows(self, first: int, end: int) -> NDArray[Any]:
+        """Stored values of the rows from ``first`` to before ``end``; of a file, no more than these are read."""
+        return self.stored[first:end]
 
     def values(self, rows: slice = slice(None), columns: slice = slice(None)) -> FloatArray:
         """Rescaled values (float64) of a window; padded pixels are NaN."""
@@ -86,6 +90,67 @@ class Slice:
         low, high = self.padding
         result: BoolArray = (stored >= low) & (stored <= high)
         return result
+
+
+class StoredRows(Protocol):
+    """Knows how to read an image of a file, or some of its rows."""
+
+    def whole(self) -> NDArray[Any]:
+        """The (rows, columns) stored values."""
+        ...
+
+    def rows(self, first: int, end: int) -> NDArray[Any]:
+        """Those of the rows from ``first`` to before ``end``."""
+        ...
+
+
+class FileSlice(Slice):
+    """A slice whose pixels are still in a file; the whole image is read, and kept, when it is first asked for.
+
+    Raises:
+        InputError: a slope that makes all pixels alike. Looking at pixels raises UnreadableSliceError where the file
+            has been taken away or cut short in the meantime.
+    """
+
+    __slots__ = ("_in_file", "_whole")
+    _in_file: StoredRows
+    _whole: NDArray[Any] | None
+
+    def __init__(
+        self,
+        *,
+        info: SliceInfo,
+        in_file: StoredRows,
+        slope: float = 1.0,
+        intercept: float = 0.0,
+        padding: tuple[float, float] | None = None,
+    ) -> None:
+        """See :class:`Slice`; ``in_file`` reads integers."""
+        _check_rescale(slope, intercept)
+        keep = object.__setattr__  # the class is frozen
+        keep(self, "info", info)
+        keep(self, "slope", slope)
+        keep(self, "intercept", intercept)
+        keep(self, "padding", padding)
+        keep(self, "_in_file", in_file)
+        keep(self, "_whole", None)
+
+    @property
+    def stored(self) -> NDArray[Any]:
+        """(rows, columns) as stored; treat as read-only."""
+        if self._whole is None:
+            object.__setattr__(self, "_whole", self._in_file.whole())
+        assert self._whole is not None
+        return self._whole
+
+    def rows(self, first: int, end: int) -> NDArray[Any]:
+        """See :meth:`Slice.rows`."""
+        return self._in_file.rows(first, end) if self._whole is None else self._whole[first:end]
+
+
+def _check_rescale(slope: float, intercept: float) -> None:
+    demand(is_number(slope) and slope != 0, "slope", slope, "a finite number that is not 0")
+    demand(is_number(intercept), "intercept", intercept, "a finite number")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

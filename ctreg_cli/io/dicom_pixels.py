@@ -7,9 +7,11 @@ no decoder is let loose on an image whose size nobody agreed to.
 
 from __future__ import annotations
 
+import os
 import struct
 import warnings
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -172,7 +174,17 @@ class NativePixels:
     #: 8-bit pixels written as big-endian words: every pair changed places (PS3.5 8.1.2)
     swapped_words: bool = False
 
-    def load(self) -> NDArray[Any]:
+    def load(self) -> NativePixels:
+        """Itself, since it reads when it is asked to; but for the file's size, of which it is sure now."""
+        try:
+            size = os.stat(self.path).st_size  # noqa: PTH116  # a Path costs twice what the call does
+        except OSError as error:
+            raise UnreadableSliceError(f"the file cannot be read ({error.strerror})") from None
+        if size < self.offset + self.layout.frame_bytes:
+            raise UnreadableSliceError(f"{tag_name('PixelData')} is cut short")
+        return self
+
+    def whole(self) -> NDArray[Any]:
         """Read the frame; the array is read-only."""
         layout, count = self.layout, self.layout.rows * self.layout.columns
         dtype = layout.dtype.newbyteorder("<" if self.little_endian else ">")
@@ -184,10 +196,19 @@ class NativePixels:
             stored = self._read(dtype, count, self.offset)
         return _finished(stored, layout)
 
+    def rows(self, first: int, end: int) -> NDArray[Any]:
+        """Read some rows, from ``first`` to before ``end``; the array is read-only."""
+        if self.swapped_words:
+            return self.whole()[first:end]
+        layout = self.layout
+        dtype = layout.dtype.newbyteorder("<" if self.little_endian else ">")
+        place = self.offset + first * layout.columns * dtype.itemsize
+        return _finished(self._read(dtype, (end - first) * layout.columns, place), layout)
+
     def _read(self, dtype: np.dtype[Any], count: int, offset: int) -> NDArray[Any]:
         stored = np.empty(count, dtype=dtype)
         try:
-            with Path(self.path).open("rb", buffering=0) as file:
+            with FileIO(self.path) as file:
                 file.seek(offset)
                 n_bytes = file.readinto(stored.data)
         except OSError as error:
@@ -297,8 +318,8 @@ def codestream_shape(codestream: bytes) -> tuple[int, int] | None:
 
 
 def _finished(stored: NDArray[Any], layout: Layout) -> NDArray[Any]:
-    """Native byte order, two dimensions, and nothing in the bits beyond Bits Stored (old overlays live there)."""
-    stored = stored.astype(layout.dtype, copy=False).reshape(layout.rows, layout.columns)
+    """Rows, whole ones: native byte order, two dimensions, nothing in the bits beyond Bits Stored (old overlays)."""
+    stored = stored.astype(layout.dtype, copy=False).reshape(-1, layout.columns)
     if layout.bits_stored < layout.bits_allocated:
         low, high = layout.stored_range
         # looking is ten times cheaper than shifting, and nearly always all there is to do

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Container, Iterator
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -87,7 +88,8 @@ class _Element(NamedTuple):
     at: int
 
 
-class _Layout(NamedTuple):
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Layout:
     """Where the elements of a head are. They are in the same places wherever the ``marks`` are the same bytes.
 
     Marks are all tags, VRs and lengths, and the values that say how to go on.
@@ -101,19 +103,27 @@ class _Layout(NamedTuple):
     elements: list[_Element]
     transfer_syntax: UID
     pixels: _Element
+    #: the last head, from slice to slice few values are others; its values and what was made of them are set at once,
+    #: since files are read in several threads
+    last: tuple[tuple[bytes, ...], PlainHeader] | None = None
 
     def header(self, head: bytes) -> PlainHeader:
         """The header of a head that is laid out like this."""
-        values = self.values(head)
-        implicit, n = self.transfer_syntax == ImplicitVRLittleEndian, len(self.meta)
-        meta, elements = (
-            {
-                tag: _raw(RawDataElement, (tag, vr, length, value, at, is_implicit, True, True, False))
-                for (tag, vr, length, at), value in zip(places, part, strict=True)
-            }
-            for places, part, is_implicit in ((self.meta, values[:n], False), (self.elements, values[n:-1], implicit))
-        )
-        return PlainHeader(meta, elements, self.transfer_syntax, *self.pixels)
+        values, n, last = self.values(head), len(self.meta), self.last
+        if last is None:
+            meta, elements, changed = {}, {}, list(range(len(values) - 1))
+        else:
+            old_values, old = last
+            meta, elements = old.meta.copy(), old.elements.copy()
+            changed = [i for i, (now, before) in enumerate(zip(values, old_values, strict=True)) if now != before]
+        is_implicit = self.transfer_syntax == ImplicitVRLittleEndian
+        for i in changed:
+            tag, vr, length, at = self.meta[i] if i < n else self.elements[i - n]
+            by_tag, implicit = (meta, False) if i < n else (elements, is_implicit)
+            by_tag[tag] = _raw(RawDataElement, (tag, vr, length, values[i], at, implicit, True, True, False))
+        header = PlainHeader(meta, elements, self.transfer_syntax, *self.pixels)
+        self.last = values, header
+        return header
 
 
 def _layout(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> _Layout | None:
@@ -150,6 +160,8 @@ def _layout(head: bytes, wanted: Container[int], pixel_tags: Container[int]) -> 
         marks.append(slice(end, at))
         end = at + length
         if tag in pixel_tags:
+            if any(len({e.tag for e in part}) < len(part) for part in (meta, kept)):
+                return None  # one is there twice
             marks_of = itemgetter(*marks)
             return _Layout(
                 marks=marks_of,

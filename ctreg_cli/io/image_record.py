@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ctreg_cli.errors import InputError
-from ctreg_cli.imaging.slice import Slice, SliceInfo, UnreadableSlice
+from ctreg_cli.imaging.slice import FileSlice, Slice, SliceInfo, StoredRows, UnreadableSlice
 
 
 class Kind(Enum):
@@ -41,8 +42,8 @@ class Instant(NamedTuple):
 class Pixels(Protocol):
     """Knows how to read one image."""
 
-    def load(self) -> NDArray[Any]:
-        """The (rows, columns) stored values.
+    def load(self) -> NDArray[Any] | StoredRows:
+        """The (rows, columns) stored values, or, where they lie open in the file, what reads them in parts.
 
         Raises:
             UnreadableSliceError: they cannot be read or decoded; the text is the bare problem.
@@ -71,12 +72,21 @@ class ImageRecord:
 
     def load(self) -> Slice | UnreadableSlice:
         """Read the pixels; a failure is a value."""
+        return self._slice(whole=True)
+
+    def open(self) -> Slice | UnreadableSlice:
+        """The same, but pixels that lie open in the file are read when they are first looked at."""
+        return self._slice(whole=False)
+
+    def _slice(self, *, whole: bool) -> Slice | UnreadableSlice:
         if self.pixels is None:
             return UnreadableSlice(info=self.info, problem=self.problem)
+        info, slope, intercept, padding = self.info, self.slope, self.intercept, self.padding
         try:
-            stored = self.pixels.load()
-            return Slice(
-                info=self.info, stored=stored, slope=self.slope, intercept=self.intercept, padding=self.padding
-            )
+            found = self.pixels.load()
+            if isinstance(found, np.ndarray) or whole:
+                stored = found if isinstance(found, np.ndarray) else found.whole()
+                return Slice(info=info, stored=stored, slope=slope, intercept=intercept, padding=padding)
+            return FileSlice(info=info, in_file=found, slope=slope, intercept=intercept, padding=padding)
         except InputError as error:
-            return UnreadableSlice(info=self.info, problem=str(error))
+            return UnreadableSlice(info=info, problem=str(error))

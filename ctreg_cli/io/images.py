@@ -20,6 +20,7 @@ import stat
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 from ctreg_cli.errors import InputError, UnreadableSliceError
@@ -40,7 +41,10 @@ NOT_A_FILE = "not a regular file"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImageSet:
-    """Slices in order, read one at a time as they are asked for; may be gone through any number of times."""
+    """Slices in order, read one at a time as they are asked for; may be gone through any number of times.
+
+    Pixels that lie open in a file are read when they are first looked at, and then kept by the slice.
+    """
 
     records: tuple[ImageRecord, ...]
     #: why files were left out → how many
@@ -54,7 +58,7 @@ class ImageSet:
         return len(self.records)
 
     def __iter__(self) -> Iterator[Slice | UnreadableSlice]:
-        return (record.load() for record in self.records)
+        return (record.open() for record in self.records)
 
 
 def open_images(paths: Sequence[Path], *, series: int | None = None) -> ImageSet:
@@ -96,7 +100,8 @@ def read_slices(*paths: str | os.PathLike[str], series: int | None = None) -> li
         UnreadableSliceError: one of them cannot be read.
     """
     slices = []
-    for item in open_images([Path(path) for path in paths], series=series):
+    for record in open_images([Path(path) for path in paths], series=series).records:
+        item = record.load()
         if isinstance(item, UnreadableSlice):
             raise UnreadableSliceError(f"{item.info.source}: {item.problem}")
         slices.append(item)
@@ -190,7 +195,7 @@ def read_image_file(path: Path, source: str) -> list[ImageRecord] | str:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):  # a pipe or a device would be waited for
             return NOT_A_FILE
-        with path.open("rb", buffering=0) as file:
+        with FileIO(path) as file:
             head = file.read(HEAD_BYTES)
     except FileNotFoundError:  # a link to nowhere
         return NOT_A_FILE

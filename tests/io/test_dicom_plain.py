@@ -124,3 +124,19 @@ def test_a_data_set_that_contradicts_its_meta_is_left_to_pydicom(syntax: str, da
     at = raw.index(struct.pack("<HH", 0x0008, 0x0008))
     assert is_plain(raw)
     assert not is_plain(raw[:at] + data + raw[at:])
+
+
+def test_an_element_that_is_there_twice_is_left_to_pydicom(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = dicom_bytes(ct_slice())
+    at = raw.index(struct.pack("<HH", 0x0018, 0x0050))
+    once = raw[at : at + 8 + struct.unpack_from("<H", raw, at + 6)[0]]
+    twice = raw[:at] + once + raw[at:]
+    assert not is_plain(twice)
+    assert told(read_header(io.BytesIO(twice), len(twice))) == by_pydicom(twice, monkeypatch)
+
+
+def test_of_files_laid_out_alike_each_has_its_own_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    raws = [dicom_bytes(ct_slice(InstanceNumber=n, SliceThickness=f"{n % 3 + 1}.5")) for n in range(1, 10)]
+    headers = [read_header(io.BytesIO(raw), len(raw)) for raw in raws]
+    for raw, header in zip(raws, headers, strict=True):  # the first are what they were when the last were read
+        assert told(header) == by_pydicom(raw, monkeypatch)

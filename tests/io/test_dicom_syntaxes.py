@@ -43,7 +43,10 @@ def test_uncompressed(tmp_path: Path, syntax: str, dtype: str, preamble: bool) -
     path = write_dicom(tmp_path / "a", ds, syntax, preamble=preamble)
     images = open_images([path])
     (slice_,) = images
+    some = slice_.rows(2, 7)  # before the rest is read
+    np.testing.assert_array_equal(some, stored[2:7])
     np.testing.assert_array_equal(slice_.stored, stored)
+    assert some.dtype == slice_.stored.dtype
     assert slice_.stored.dtype.isnative
     assert slice_.info.scale is not None
     assert (slice_.info.scale.s_x, slice_.info.scale.s_y) == (0.5, 0.75)
@@ -58,6 +61,16 @@ def test_big_endian_bytes_in_words_change_places(tmp_path: Path) -> None:
     path = write_dicom(tmp_path / "a.dcm", ds, ExplicitVRBigEndian)
     np.testing.assert_array_equal(read_slices(path)[0].stored, pydicom.dcmread(path).pixel_array)
     np.testing.assert_array_equal(read_slices(path)[0].stored, stored)
+    np.testing.assert_array_equal(next(iter(open_images([path]))).rows(3, 6), stored[3:6])
+
+
+def test_bits_beyond_bits_stored_are_no_part_of_a_pixel(tmp_path: Path) -> None:
+    for dtype, low in (("<u2", 0), ("<i2", -60)):
+        stored = pixels(11, 13, dtype, low)
+        ds = ct_slice((stored & 0x0FFF | 0x7000).astype(dtype), BitsStored=12, HighBit=11)
+        path = write_dicom(tmp_path / "overlay.dcm", ds)
+        np.testing.assert_array_equal(read_slices(path)[0].stored, stored)
+        np.testing.assert_array_equal(next(iter(open_images([path]))).rows(4, 9), stored[4:9])
 
 
 def test_bare_data_set_is_read_as_implicit_little_endian_with_a_warning(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tracemalloc
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -341,12 +342,12 @@ def test_files_and_folders_that_may_not_be_opened(tmp_path: Path, monkeypatch: p
     write_series(tmp_path, 2)
     write_dicom(tmp_path / "mine")
     (tmp_path / "closed").mkdir()
-    opened, listed = Path.open, os.scandir
+    listed = os.scandir
 
-    def refuse_file(path: Path, *args: Any, **options: Any) -> Any:
+    def refuse_file(path: Path) -> FileIO:
         if path.name == "mine":
             raise PermissionError(13, "Permission denied", str(path))
-        return opened(path, *args, **options)
+        return FileIO(path)
 
     def refuse_folder(path: str) -> Any:
         if Path(path) in refused:
@@ -354,7 +355,7 @@ def test_files_and_folders_that_may_not_be_opened(tmp_path: Path, monkeypatch: p
         return listed(path)
 
     refused = {tmp_path / "closed"}
-    monkeypatch.setattr(Path, "open", refuse_file)
+    monkeypatch.setattr("ctreg_cli.io.images.FileIO", refuse_file)
     monkeypatch.setattr(os, "scandir", refuse_folder)
     images = open_images([tmp_path])
     assert sources(images) == ["s0.dcm", "s1.dcm", "mine"]
@@ -384,8 +385,9 @@ def test_memory_does_not_grow_with_the_pixels(tmp_path: Path) -> None:
     try:
         images = open_images([tmp_path])
         before = tracemalloc.get_traced_memory()[0]
-        for _ in images:
-            pass
+        for item in images:
+            assert isinstance(item, Slice)
+            _ = item.stored
         held, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
