@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -81,8 +81,10 @@ _ROUNDING = 1e-12
 _CHUNK = 12_000
 #: so many spot triples of one rod triple are worth a call of their own
 _ALONE = 3_000
-#: above this many spots a tree finds the nearest
+#: above this many spots a tree finds the nearest, and it pays to think about the order of the rod triples
 _MANY_SPOTS = 32
+#: ... of which there are no more than this (of twelve rods): else finding an order that covers takes as long
+_MOST_REORDERED = 220
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -189,6 +191,30 @@ def plan(model: RodModel) -> SearchPlan:
     )
 
 
+def plan_among(model: RodModel, scene: Scene) -> SearchPlan:
+    """The plan with rod triples first that few triples of these very spots could be.
+
+    Among many spots a rod triple takes a second, and another, nearly as strong, half of that. How many triples of spots
+    it leaves to try is reckoned from how many pairs could be two of its rods.
+    """
+    from scipy.spatial.distance import pdist
+
+    layout = plan(model)
+    if len(layout.triples) > _MOST_REORDERED:
+        return layout
+    gap, slack_mm = pdist(scene.xy_mm), 4 * noise_mm(model, scene)
+    first, second = np.triu_indices(len(model), 1)
+    fits = (gap >= layout.least_mm[first, second, None] - slack_mm) & (
+        gap <= layout.greatest_mm[first, second, None] + slack_mm
+    )
+    share = np.ones((len(model), len(model)))
+    share[first, second] = share[second, first] = np.maximum(np.count_nonzero(fits, axis=1), 1) / len(gap)
+    a, b, c = layout.triples.T
+    worth = layout.strength / np.sqrt(share[a, b] * share[a, c] * share[b, c])
+    order, prefix = _covering_order(len(model), layout.triples, worth)
+    return replace(layout, triples=layout.triples[order], prefix=prefix, strength=layout.strength[order])
+
+
 def _triple_strength(model: RodModel, triples: IntArray) -> FloatArray:
     """|det J|^(1/6) of each triple's motion field, median over tilts about the frame's own axis and all heights."""
     rng = np.random.default_rng(20081)  # a fixed design of poses, not an experiment
@@ -265,7 +291,7 @@ def search(model: RodModel, scene: Scene, *, least_matches: int = 4) -> Matches 
     m = len(scene.xy_mm)
     if m < least_matches:
         return None
-    layout = plan(model)
+    layout = plan(model) if m <= _MANY_SPOTS else plan_among(model, scene)
     found: list[Matches] = []
     seen: set[bytes] = set()
     best: Matches | None = None

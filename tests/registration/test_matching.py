@@ -9,7 +9,15 @@ import pytest
 
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.matching import LEAST_CHECKED, _vote, plan, search, visibility
+from ctreg_cli.registration.matching import (
+    LEAST_CHECKED,
+    SearchPlan,
+    _vote,
+    plan,
+    plan_among,
+    search,
+    visibility,
+)
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
@@ -27,6 +35,37 @@ def test_two_triples_of_any_five_rods_are_tried(n: int) -> None:
         tried = [set(map(int, triple)) for triple in layout.triples[: layout.prefix[k]]]
         for rods in itertools.combinations(range(n), k):
             assert sum(triple <= set(rods) for triple in tried) >= 2, (k, rods)
+
+
+@pytest.mark.parametrize("n", [6, 9])
+def test_among_many_spots_cheap_triples_come_first_and_any_five_rods_still_hold_two(n: int) -> None:
+    rng = np.random.default_rng([859, n])
+    ratios = []
+    for _ in range(8):
+        model = model_of(random_frame(rng, n))
+        across_px = model.size_mm / HALF_MM.s_x
+        uv = np.concatenate([rng.uniform(0, part * across_px, (20, 2)) for part in (0.4, 1.5)])  # many near pairs
+        scene = make_scene(Spots.from_points(uv, 0.1), model, HALF_MM, options=RegistrationOptions())
+        layout, among = plan(model), plan_among(model, scene)
+        assert sorted(map(tuple, layout.triples.tolist())) == sorted(map(tuple, among.triples.tolist()))
+        for k in range(LEAST_CHECKED + 1, n + 1):
+            tried = [set(map(int, triple)) for triple in among.triples[: among.prefix[k]]]
+            for rods in itertools.combinations(range(n), k):
+                assert sum(triple <= set(rods) for triple in tried) >= 2, (k, rods)
+        first = [possible_triples(scene.xy_mm, each.triples[0], each) for each in (among, layout)]
+        ratios.append(first[0] / first[1])
+    assert max(ratios) <= 1.2
+    assert np.mean(ratios) < 0.9
+
+
+def possible_triples(xy_mm: np.ndarray, rods: np.ndarray, layout: SearchPlan) -> int:
+    """How many ordered triples of spots these three rods could show, each looked at."""
+    gap = np.linalg.norm(xy_mm[:, None] - xy_mm, axis=-1)
+    fits = [
+        (gap >= layout.least_mm[i, j]) & (gap <= layout.greatest_mm[i, j]) & ~np.eye(len(gap), dtype=bool)
+        for i, j in (rods[[0, 1]], rods[[0, 2]], rods[[1, 2]])
+    ]
+    return int((fits[0][:, :, None] & fits[1][:, None] & fits[2][None]).sum())
 
 
 @pytest.mark.parametrize("sd_px", [0.1, 0.3])
