@@ -113,39 +113,54 @@ class FileSlice(Slice):
     """
 
     __slots__ = ("_in_file", "_whole")
-    _in_file: StoredRows
+    _in_file: StoredRows | None
     _whole: NDArray[Any] | None
 
     def __init__(
         self,
         *,
         info: SliceInfo,
-        in_file: StoredRows,
+        stored: StoredRows | NDArray[Any],
         slope: float = 1.0,
         intercept: float = 0.0,
         padding: tuple[float, float] | None = None,
     ) -> None:
-        """See :class:`Slice`; ``in_file`` reads integers."""
+        """See :class:`Slice`; ``stored`` reads integers, or has been read."""
         _check_rescale(slope, intercept)
+        is_read = isinstance(stored, np.ndarray)
         keep = object.__setattr__  # the class is frozen
         keep(self, "info", info)
         keep(self, "slope", slope)
         keep(self, "intercept", intercept)
         keep(self, "padding", padding)
-        keep(self, "_in_file", in_file)
-        keep(self, "_whole", None)
+        keep(self, "_in_file", None if is_read else stored)
+        keep(self, "_whole", stored if is_read else None)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process gets the pixels, not the file."""
+        return _slice, (self.info, self.stored, self.slope, self.intercept, self.padding)
 
     @property
     def stored(self) -> NDArray[Any]:
         """(rows, columns) as stored; treat as read-only."""
-        if self._whole is None:
-            object.__setattr__(self, "_whole", self._in_file.whole())
-        assert self._whole is not None
-        return self._whole
+        whole, in_file = self._whole, self._in_file
+        if whole is None:
+            assert in_file is not None
+            whole = in_file.whole()
+            object.__setattr__(self, "_whole", whole)
+        return whole
 
     def rows(self, first: int, end: int) -> NDArray[Any]:
         """See :meth:`Slice.rows`."""
-        return self._in_file.rows(first, end) if self._whole is None else self._whole[first:end]
+        if self._whole is not None or self._in_file is None:
+            return self.stored[first:end]
+        return self._in_file.rows(first, end)
+
+
+def _slice(
+    info: SliceInfo, stored: NDArray[Any], slope: float, intercept: float, padding: tuple[float, float] | None
+) -> Slice:
+    return Slice(info=info, stored=stored, slope=slope, intercept=intercept, padding=padding)
 
 
 def _check_rescale(slope: float, intercept: float) -> None:

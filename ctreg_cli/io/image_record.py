@@ -87,6 +87,6 @@ class ImageRecord:
             if isinstance(found, np.ndarray) or whole:
                 stored = found if isinstance(found, np.ndarray) else found.whole()
                 return Slice(info=info, stored=stored, slope=slope, intercept=intercept, padding=padding)
-            return FileSlice(info=info, in_file=found, slope=slope, intercept=intercept, padding=padding)
+            return FileSlice(info=info, stored=found, slope=slope, intercept=intercept, padding=padding)
         except InputError as error:
             return UnreadableSlice(info=info, problem=str(error))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import pickle
 import tracemalloc
+from dataclasses import replace
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ from typer.testing import CliRunner
 
 from ctreg_cli.cli.info import info
 from ctreg_cli.errors import InputError, UnreadableSliceError
-from ctreg_cli.imaging.slice import Slice, UnreadableSlice
+from ctreg_cli.imaging.slice import FileSlice, Slice, UnreadableSlice
 from ctreg_cli.io.image_files import natural_key
 from ctreg_cli.io.images import ImageSet, list_series, open_images, read_slices
 from tests.io.dicom_samples import ct_slice, dicom_bytes, pixels, write_dicom
@@ -371,6 +374,18 @@ def test_names_of_any_bytes_can_be_written(tmp_path: Path) -> None:
     (source,) = sources(open_images([tmp_path]))
     assert source == "caf\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}.dcm"
     assert source.encode("utf-8")
+
+
+@pytest.mark.parametrize("other", [copy.copy, copy.deepcopy, lambda item: pickle.loads(pickle.dumps(item)), replace])
+def test_a_slice_that_has_not_been_read_can_be_copied_and_sent(tmp_path: Path, other: Any) -> None:
+    write_dicom(tmp_path / "a.dcm", ct_slice(RescaleIntercept=-7))
+    (item,) = open_images([tmp_path])
+    assert isinstance(item, FileSlice)
+    twin = other(item)
+    assert isinstance(twin, Slice)
+    (tmp_path / "a.dcm").unlink()
+    np.testing.assert_array_equal(twin.stored, pixels())
+    assert (twin.info.source, twin.slope, twin.intercept) == ("a.dcm", item.slope, -7.0)
 
 
 def test_memory_does_not_grow_with_the_pixels(tmp_path: Path) -> None:
