@@ -8,7 +8,9 @@ from scipy.spatial.transform import Rotation
 from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
-from ctreg_cli.registration.register import register
+from ctreg_cli.registration.matching import Scene
+from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.registration.result import Registration
 from ctreg_cli.rods import Mount, Rod, RodModel
 from ctreg_cli.scale import Scale
@@ -55,6 +57,19 @@ def spots_of(world: OracleScene) -> Spots:
 def scale_of(world: OracleScene) -> Scale:
     """Its scale."""
     return Scale(s_x=float(world.mm_per_px[0]), s_y=float(world.mm_per_px[1]))
+
+
+def scene_of(world: OracleScene, model: RodModel) -> Scene:
+    """The package's view of it."""
+    return make_scene(spots_of(world), model, scale_of(world), options=RegistrationOptions())
+
+
+def true_match(world: OracleScene, model: RodModel) -> np.ndarray:
+    """(n,) the true spot of each rod, −1 for none."""
+    spot_of_rod = np.full(len(model), -1)
+    is_true = world.rod_of_spot >= 0
+    spot_of_rod[world.rod_of_spot[is_true]] = np.nonzero(is_true)[0]
+    return spot_of_rod
 
 
 def registered(world: OracleScene, model: RodModel) -> Registration:

@@ -15,7 +15,7 @@ from ctreg_cli.registration.register import make_scene
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from tests.oracle import cross_rod, random_frame
-from tests.registration.frames import model_of, some_scene
+from tests.registration.frames import model_of, scene_of, some_scene, true_match
 
 HALF_MM = Scale(s_x=0.5, s_y=0.5)
 
@@ -28,12 +28,10 @@ def test_every_minimum_of_the_true_match_is_found(seed: int) -> None:
     world = some_scene(rng, frame, sd_px=0.3, least=5)
     model, spots = model_of(frame), Spots.from_points(world.uv_px, 0.3)
     minima = register_labelled(spots, world.rod_of_spot, model, scale=HALF_MM)
-    scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
+    scene, true = scene_of(world, model), true_match(world, model)
     found = search(model, scene, least_matches=4)
     assert found is not None, seed
     found = doubt(model, scene, found, least_matches=4)
-    true = np.full(len(model), -1)
-    true[world.rod_of_spot] = np.arange(len(spots))
     same = [T for T, match in zip(found.T, found.spot_of_rod, strict=True) if (match == true).all()]
     for minimum in (m for m in minima if m.chi2 < minima[0].chi2 + 9):
         turns = [poses.rotation_angle(T[:3, :3] @ minimum.T_slice_model[:3, :3].T) for T in same]
@@ -51,9 +49,7 @@ def test_doubt_leads_from_a_poor_minimum_to_the_true_match(seed: int) -> None:
     short[0] = -1
     minima = register_labelled(spots, short, model, scale=HALF_MM)
     turned = [m for m in minima if poses.rotation_angle(m.T_slice_model[:3, :3] @ world.R.T) > np.radians(15)]
-    scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
-    true = np.full((1, len(model)), -1)
-    true[0, world.rod_of_spot] = np.arange(len(spots))
+    scene, true = scene_of(world, model), true_match(world, model)[None]
     less = np.where(true == 0, -1, true)
     poor = weigh(model, scene, turned[0].T_slice_model[None], less, 4)
     full = weigh(model, scene, poses.make_pose(world.R, world.t)[None], true, 4)
@@ -86,8 +82,7 @@ def planted(seed: int) -> tuple[RodModel, Scene, Matches, Matches] | None:
             continue
         uv = np.concatenate([world.uv_px, (hit[0] / 0.5 + rng.normal(size=2) * 0.3)[None]])
         scene = make_scene(Spots.from_points(uv, 0.3), model, HALF_MM, options=RegistrationOptions())
-        true = np.full((1, len(model)), -1)
-        true[0, world.rod_of_spot] = np.arange(8)
+        true = true_match(world, model)[None]
         false = true.copy()
         false[0, lost] = 8, -1
         poor = weigh(model, scene, T[None], false, 4)

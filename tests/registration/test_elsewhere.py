@@ -8,14 +8,11 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
-from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.linearity import length_of_the_valley
-from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.refine import Observations, covariance_from_information, linearise, refine
-from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.rods import RodModel, Target
 from tests.oracle import OracleScene, random_frame
-from tests.registration.frames import model_of, scale_of, some_scene
+from tests.registration.frames import model_of, registered, scene_of, some_scene
 
 TIP = np.array([0.0, 0.0, 60.0])
 #: rise of χ² that is still a percent of the best in odds
@@ -54,8 +51,7 @@ def test_every_pose_that_the_spots_allow_without_one_lies_within_the_level() -> 
     starts, elsewhere, checked = 48, 0, 0
     for _ in range(12):
         model, world = a_scene(rng, sd_px=0.1)
-        scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, scale_of(world), options=RegistrationOptions())
-        result = register(Spots.from_points(world.uv_px, 0.1), model, scale=scale_of(world))
+        scene, result = scene_of(world, model), registered(world, model)
         if result.status != "ok":
             continue
         T, level = result.candidates[0].T_slice_model, result.candidates[0].protection_mm[0]

@@ -22,7 +22,7 @@ from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
 from tests.oracle import random_frame
-from tests.registration.frames import model_of, some_scene
+from tests.registration.frames import model_of, scene_of, some_scene, true_match
 
 HALF_MM = Scale(s_x=0.5, s_y=0.5)
 
@@ -74,10 +74,8 @@ def test_the_true_labels_are_among_the_matches(sd_px: float) -> None:
     for seed in range(12):
         frame = random_frame(rng, 8)
         world = some_scene(rng, frame, sd_px=sd_px, missing=1, false=3, least=6)
-        spots = Spots.from_points(world.uv_px, world.sd_px)
         model = model_of(frame)
-        scene = make_scene(spots, model, HALF_MM, options=RegistrationOptions())
-        found = search(model, scene, least_matches=5)
+        found = search(model, scene_of(world, model), least_matches=5)
         true = {(int(rod), spot) for spot, rod in enumerate(world.rod_of_spot) if rod >= 0}
         assert found is not None, seed
         matches = [{(rod, int(spot)) for rod, spot in enumerate(row) if spot >= 0} for row in found.spot_of_rod]
@@ -137,8 +135,7 @@ def test_few_spots_are_looked_at_from_every_triple(seed: int) -> None:
     frame = random_frame(rng, 8)
     world = some_scene(rng, frame, sd_px=0.1, missing=3, false=4)
     model = model_of(frame)
-    scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, HALF_MM, options=RegistrationOptions())
-    assert search(model, scene, least_matches=5) is not None, seed
+    assert search(model, scene_of(world, model), least_matches=5) is not None, seed
 
 
 @pytest.mark.parametrize("seed", [460, *range(4)])
@@ -148,12 +145,9 @@ def test_the_truth_is_found_in_five_spots_whatever_else_is(seed: int) -> None:
     frame = random_frame(rng, 9)
     world = some_scene(rng, frame, sd_px=0.05, missing=4, least=5)
     model = model_of(frame)
-    scene = make_scene(Spots.from_points(world.uv_px, 0.05), model, HALF_MM, options=RegistrationOptions())
-    true = np.full(len(model), -1)
-    true[world.rod_of_spot] = np.arange(len(world.uv_px))
-    found = search(model, scene, least_matches=5)
+    found = search(model, scene_of(world, model), least_matches=5)
     assert found is not None, seed
-    assert (found.spot_of_rod == true).all(axis=1).any(), seed
+    assert (found.spot_of_rod == true_match(world, model)).all(axis=1).any(), seed
 
 
 def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
@@ -161,7 +155,7 @@ def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
     frame = random_frame(rng, 7)
     model = model_of(frame)
     world = some_scene(rng, frame, sd_px=0.1, false=5, least=7)
-    scene = make_scene(Spots.from_points(world.uv_px, 0.1), model, HALF_MM, options=RegistrationOptions())
+    scene = scene_of(world, model)
     b = 400
     rods, spots = np.tile([0, 1, 2], (b, 1)), np.tile(np.arange(3), (b, 1))
     # the last rod turned into the slice's plane but for 10⁻⁴ … 10⁻⁶ rad, and near a spot where it crosses
