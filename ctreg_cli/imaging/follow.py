@@ -165,17 +165,21 @@ class Follower:
             blobs, lone = measure_lone_blobs(image, middles, RADIUS_PX)
             blobs, learned = blobs.take(lone), rods[due][lone]
             if len(learned):
-                fitted = fit_profiles(blobs, image.ceiling)
-                # of the others a step is not worth more than a fit
-                smooth = ~(fitted.sharp | fitted.flat | are_masks(blobs))
-                if not smooth.all():
-                    blobs, learned = blobs.take(smooth), learned[smooth]
-                    fitted = fit_profiles(blobs, image.ceiling)
-            if len(learned):
-                self._waits |= dict.fromkeys(learned.tolist(), (0, 0))
-                known = _Known.of(learned, blobs, fitted)
-                self._known = known if self._known is None else self._known.joined(known)
+                self._learn(learned, blobs, image.ceiling)
         return spots
+
+    def _learn(self, rods: IntArray, blobs: Blobs, ceiling: float) -> None:
+        """Remember how the spots of rods (k,) look, but for those of which a step is worth no more than a fit."""
+        fitted = fit_profiles(blobs, ceiling)
+        smooth = ~(fitted.sharp | fitted.flat | are_masks(blobs))
+        if not smooth.any():
+            return
+        if not smooth.all():
+            blobs, rods = blobs.take(smooth), rods[smooth]
+            fitted = fit_profiles(blobs, ceiling)
+        self._waits |= dict.fromkeys(rods.tolist(), (0, 0))
+        known = _Known.of(rods, blobs, fitted)
+        self._known = known if self._known is None else self._known.joined(known)
 
     def _is_due(self, rod: int) -> bool:
         """Whether to try and learn how the spot of a rod looks; the next try, should it fail, comes later and later."""

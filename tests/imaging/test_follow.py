@@ -323,6 +323,25 @@ def test_rods_come_and_go_and_each_keeps_its_own_looks() -> None:
             np.testing.assert_allclose(matched(spots, uv[rods]).uv_px, uv[rods], atol=0.06)
 
 
+SHARP = {"mm_per_px": 1.0, "diameter_mm": 0.6, "blur_mm": 0.15, "contrast": 9000.0, "slope": (0.0, 0.0)}
+FLAT = {"mm_per_px": 0.5, "diameter_mm": 6.0, "blur_mm": 0.4, "contrast": 2500.0, "slope": (0.0, 0.0)}
+
+
+@pytest.mark.parametrize("kinds", [[SHARP, SHARP], [FLAT, FLAT], [ROD, SHARP], [ROD, FLAT]])
+@pytest.mark.parametrize("mask", [False, True])
+def test_what_no_step_serves_is_measured_in_full_in_every_slice(kinds: list[dict[str, object]], mask: bool) -> None:
+    rng, follower, uv = np.random.default_rng(13), Follower(), np.array([[22.3, 34.6], [55.4, 28.1]])
+    for _ in range(6):
+        uv = uv + rng.uniform(-0.4, 0.4, uv.shape)
+        image = sum((render_rod(SHAPE, tuple(uv[k]), **kinds[k]) for k in range(2)), rng.normal(0.0, NOISE, SHAPE))
+        slice_ = as_slice(np.where(image > 800, 255, 0) if mask else image)
+        spots = follower.measure(slice_, np.arange(2), uv, np.full(2, 4.0))
+        full = matched(measure_spots(slice_, uv, np.full(2, 4.0)), uv)
+        assert len(spots) == 2
+        spots = matched(spots, uv)
+        np.testing.assert_allclose(spots.uv_px, full.uv_px, atol=0.2 * full.sd_px.max())
+
+
 def test_everything_is_measured_in_full_now_and_then_and_when_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(12)
     counts, follower = in_full(monkeypatch), Follower()
