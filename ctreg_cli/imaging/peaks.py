@@ -83,8 +83,9 @@ def rate_peaks(image: UprightImage, pixels: IntArray, heights: FloatArray, max_h
     samples = image.at(pixels[:, 1, None, None] + rows, pixels[:, 0, None, None] + columns)
     rings = nan_quantile(samples, BACKGROUND_QUANTILE)
     rings = np.where(np.isnan(rings), heights[:, None], rings)
-    contrast = heights - rings.min(axis=1)
-    fallen = rings < (heights - 0.5 * contrast)[:, None]
+    with np.errstate(invalid="ignore"):  # a place may show nothing of the image
+        contrast = heights - rings.min(axis=1)
+        fallen = rings < (heights - 0.5 * contrast)[:, None]
     half_width = np.where(fallen.any(axis=1), radii[fallen.argmax(axis=1)], np.inf)
     return Peaks(pixels=pixels, contrast=contrast, half_width=half_width)
 

@@ -256,7 +256,8 @@ def _brightest_place(windows: FloatArray) -> IntArray:
     flat = windows.reshape(k, -1)
     top = flat.max(axis=1)
     least = np.where(np.isfinite(flat), flat, np.inf).min(axis=1)
-    bright = (flat >= (top - BRIGHTEST * (top - least))[:, None]).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a window may show nothing of the image
+        bright = (flat >= (top - BRIGHTEST * (top - least))[:, None]).astype(np.float64)
     u, v = (axis.ravel() for axis in grid(n // 2))
     sums = bright @ np.stack([u, v, np.ones(n * n)], axis=1)
     offset: IntArray = np.rint(sums[:, :2] / np.maximum(sums[:, 2:], 1.0)).astype(np.intp)
