@@ -518,7 +518,10 @@ def _vote(
     own = tolerance[row, rods] + scene.covariance_mm[spots]
     J_own, J = J[row, rods], J[row, others]
     WJ = (invert_2x2(own) @ J_own).reshape(b, 6, 6)
-    information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + np.diag([size**-2.0] * 3 + [1.0] * 3)
+    unit = np.array([size] * 3 + [1.0] * 3)
+    information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + np.diag(unit**-2.0)
+    # of spots known to a millionth of a pixel one direction may be all that rounding leaves
+    information += (_ROUNDING * np.einsum("bii,i->b", information, unit * unit))[:, None, None] * np.diag(unit**-2.0)
     JC = (J.reshape(b, -1, 6) @ np.linalg.inv(information)).reshape(J.shape)
     gate = JC @ np.swapaxes(J, -1, -2) + tolerance[row, others] + np.median(scene.covariance_mm, axis=0)
     r = np.where(hopeful[..., None], scene.xy_mm[nearest] - projection.xy_mm[row, others], 0)

@@ -105,11 +105,21 @@ def gauss_newton_step(H: FloatArray, g: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
 
 
+#: share of a determinant that rounding can hide
+_ROUNDING = 4e-16
+
+
 def invert_2x2(matrices: FloatArray) -> FloatArray:
-    """Inverses of (..., 2, 2) matrices, in closed form."""
+    """Inverses of positive definite (..., 2, 2) matrices, in closed form.
+
+    Where rounding leaves no determinant (a rod with a tolerance that all but lies in the slice), it is taken to be as
+    large as rounding can hide.
+    """
     a, b, c, d = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 0], matrices[..., 1, 1]
     det = a * d
     det -= b * c
+    if not (det > 0).all():
+        det = np.maximum(det, _ROUNDING * (a * d))
     result: FloatArray = np.empty_like(matrices)
     result[..., 0, 0], result[..., 0, 1], result[..., 1, 0], result[..., 1, 1] = d, -b, -c, a
     result /= det[..., None, None]

@@ -19,6 +19,7 @@ from ctreg_cli.registration.matching import (
     visibility,
 )
 from ctreg_cli.registration.options import RegistrationOptions
+from ctreg_cli.registration.refine import invert_2x2
 from ctreg_cli.registration.register import make_scene, register
 from ctreg_cli.scale import Scale
 from tests.oracle import random_frame
@@ -172,3 +173,29 @@ def test_a_rod_that_all_but_lies_in_the_slice_casts_no_vote() -> None:
     score, _, _ = _vote(model, scene, T, rods, spots, 1)
     assert len(score) > 20, len(score)
     assert np.isfinite(score).all()
+
+
+@pytest.mark.parametrize("seed", [10, 14, 32, 0, 3, 6])
+def test_spots_known_to_a_millionth_of_a_pixel_beside_others_hardly_known_end_in_a_verdict(seed: int) -> None:
+    """In the first three, rounding left no inverse of what three such spots say."""
+    rng = np.random.default_rng([870, seed])
+    frame = random_frame(rng, 6 + seed % 4)
+    world = some_scene(rng, frame, sd_px=0.1, false=4, least=5)
+    sd = 10.0 ** (rng.uniform(-6, 6, (len(world.uv_px), 2)) if seed % 3 else rng.uniform(-6, -3, (len(world.uv_px), 1)))
+    spots = Spots(uv_px=world.uv_px, covariance_px=sd[:, :, None] ** 2 * np.eye(2))
+    result = register(spots, model_of(frame, tolerance_mm=0.3 * (seed % 2)), scale=HALF_MM)
+    assert result.status in ("ok", "ambiguous", "no_pose")
+
+
+def test_a_rod_with_a_tolerance_that_all_but_lies_in_the_slice_weighs_nothing() -> None:
+    rng = np.random.default_rng(871)
+    slope = rng.normal(size=(50, 2))
+    slope *= (10.0 ** np.linspace(-1, 12, 50) / np.linalg.norm(slope, axis=1))[:, None]
+    covariance = 0.01 * np.eye(2) + 0.09 * (np.eye(2) + slope[:, :, None] * slope[:, None])
+    weight = invert_2x2(covariance)
+    along = np.einsum("ki,kij,kj->k", slope, weight, slope) / (slope**2).sum(axis=1)
+    true = 1 / (0.1 + 0.09 * (slope**2).sum(axis=1))
+    assert np.isfinite(weight).all()
+    steep = np.linalg.norm(slope, axis=1)
+    np.testing.assert_allclose(along[steep < 1e3], true[steep < 1e3], rtol=1e-3)
+    assert (np.abs(along[steep >= 1e3]) < 1e-2).all()
