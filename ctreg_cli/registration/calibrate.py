@@ -187,14 +187,14 @@ def _fit_from(
 
 def _believable(fit: _Fit) -> bool:
     low, high = SCALE_RANGE
-    sd = np.sqrt(np.diag(fit.covariance))
+    variance = fit.covariance.diagonal()  # rounding may make those of spots that say next to nothing negative
     return bool(
         np.isfinite(fit.chi2)
         and fit.degrees_of_freedom > 0
         and chdtrc(fit.degrees_of_freedom, fit.chi2) > BAD_FIT_P**2
         and (fit.mm_per_px > 0.9 * low).all()
         and (fit.mm_per_px < 1.1 * high).all()
-        and (sd < 0.2 * fit.mm_per_px).all()
+        and ((variance > 0) & (variance < (0.2 * fit.mm_per_px) ** 2)).all()
     )
 
 
