@@ -9,10 +9,11 @@ none) for each of the ``n`` rods, because the matcher has thousands of them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
+from ctreg_cli.arrays import BoolArray, FloatArray, IntArray, frozen
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.motion_field import motion_field, scale_jacobian
 from ctreg_cli.geometry.projection import Projection, project
@@ -126,18 +127,41 @@ def invert_2x2(matrices: FloatArray) -> FloatArray:
     return result
 
 
-def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, half_slab_mm: float) -> FloatArray:
-    """How far along ``slope`` (..., n) mm of z a spot may lie off its crossing because the rod ends inside the slab.
+#: diameter of rods whose frame file gives none, mm
+UNKNOWN_DIAMETER_MM = 2.0
 
-    The spot is the mean of what metal the slab holds. Where a length of the slab's height is empty, its middle lies
-    half that length off the mid-plane, and the spot as much times the slope.
+
+@lru_cache(maxsize=16)
+def rod_radii(model: RodModel) -> FloatArray:
+    """(n,) mm; cached, since a model is a value that never changes."""
+    return frozen([0.5 * (rod.diameter_mm or UNKNOWN_DIAMETER_MM) for rod in model.rods], (None,))
+
+
+def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, half_slab_mm: float) -> FloatArray:
+    """How far along ``slope`` (..., n), mm of z, a spot may lie off its crossing because its rod ends in the slab.
+
+    The spot is the mean of what metal the slab holds. Where the end leaves a length of the slab's height empty, its
+    middle lies half that length off the mid-plane, and the spot as much times the slope. Where the oblique face of the
+    end crosses the slab, half-moons are left of discs, whose middles lie up to half a radius to the side. What is left
+    is seen as long as it is a third of the metal: ``h + face``, ``h`` half the slab, bounds what that does.
+
+    It is charged in full where the end may lie in the slab, and less and less as far beyond as it could have moved the
+    pose: rods that end together carry the pose with them, and seen from there their ends are farther off by as much.
+
+    Args:
+        model: the rods.
+        slope: (..., n, 2) of the rods.
+        lambda_mm: (..., n) where along them they are crossed.
+        half_slab_mm: half the slab's thickness, not zero.
     """
-    rise = 1 / np.sqrt(1 + (slope * slope).sum(axis=-1))  # mm of z per mm of rod
-    result: FloatArray = np.zeros_like(rise)
-    for to_end in (lambda_mm, model.lengths - lambda_mm):
-        empty = half_slab_mm - to_end * rise
-        result += np.minimum(np.maximum(empty, 0), 2 * half_slab_mm)
-    result *= 0.5
+    squared = (slope * slope).sum(axis=-1)
+    rise = 1 / np.sqrt(1 + squared)  # mm of z per mm of rod
+    tangent = np.sqrt(squared)
+    face_height = rod_radii(model) * tangent * rise  # of half the face, mm
+    face = 0.5 * rod_radii(model) * np.minimum(1.0, face_height / half_slab_mm) / np.maximum(tangent, 1e-9)
+    reach = 2 * half_slab_mm + face
+    beyond = reach + face_height - np.minimum(lambda_mm, model.lengths - lambda_mm) * rise
+    result: FloatArray = (half_slab_mm + face) * np.clip(beyond / reach, 0, 1)
     return result
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.registration.matching import MOST_BEYOND_END, Scene, nearest_assignment
+from ctreg_cli.registration.refine import rod_end_shift, rod_radii
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import Crossing, cross, greatest_tolerance_mm, model_lines
 
@@ -79,12 +80,21 @@ class Outlook:
     def _inside(self, cut: BoolArray) -> BoolArray:
         return cut if self._in_field is None else cut & self._in_field
 
-    def rod_end_shift_mm(self, rods: IntArray) -> float:
-        """How far in z a spot may lie off its crossing because one of ``rods`` ends inside the slab, at most; mm."""
+    def has_ends_near(self, rods: IntArray) -> bool:
+        """Whether one of ``rods`` ends in the slab, or so near that its spot may be off.
+
+        See :func:`~ctreg_cli.registration.refine.rod_end_shift`.
+        """
         half_slab_mm = self.scene.half_slab_mm
         if half_slab_mm == 0:
-            return 0.0
-        return max(0.0, half_slab_mm - float((self._to_end_mm / self.crossing.mm_per_height)[rods].min()))
+            return False
+        radius = float(rod_radii(self.model).max())
+        # no shift reaches farther than this: a face is half a radius squared over half the slab at most
+        farthest = 2 * half_slab_mm + radius + 0.5 * radius * radius / half_slab_mm
+        crossing = self.crossing
+        if float((self._to_end_mm / crossing.mm_per_height)[rods].min()) > farthest:  # nearly always
+            return False
+        return bool(rod_end_shift(self.model, crossing.slope, crossing.lambda_mm, half_slab_mm)[rods].any())
 
     def assigned(self, covariance: FloatArray, spread_mm2: FloatArray | None = None) -> IntArray:
         """Spot of each rod (n,), −1 for none, one to one, within gates by the pose's ``covariance`` (6, 6).

@@ -110,7 +110,7 @@ def verified(
     if not all(outlook.may_be_seen()[rods].tolist()) or len(missing) > len(rods):
         return None
     apart2 = _least_distance2(crossings.xy_mm, rods, missing)
-    if apart2 < _reach_mm(model) ** 2 or outlook.rod_end_shift_mm(rods) > 0:
+    if apart2 < _reach_mm(model) ** 2 or outlook.has_ends_near(rods):
         return None
     without = LeftOut.of(moved)
     if without is None or _contested(scene, moved, without, spot_of_rod[rods], apart2):

@@ -16,6 +16,7 @@ from ctreg_cli.registration.refine import (
     refine_scales,
     rod_end_shift,
 )
+from ctreg_cli.rods import Rod, RodModel
 from tests.oracle import OracleFrame, OracleScene, cross_line, random_frame
 from tests.registration.frames import model_of, some_scene
 
@@ -102,19 +103,48 @@ def test_a_direction_nobody_sees_gets_a_huge_variance() -> None:
     np.testing.assert_allclose(np.diag(covariance)[:5], [1, 1, 1, 0.01, 0.01])
 
 
-def test_a_rod_that_ends_in_the_slab_counts_for_less() -> None:
-    rng = np.random.default_rng(914)
-    frame = random_frame(rng, 6)
-    model = model_of(frame)
-    slope = np.tile([0.5, -0.3], (1, 6, 1))
-    rise = 1 / np.sqrt(1 + 0.5**2 + 0.3**2)
-    middle = rod_end_shift(model, slope, 0.5 * model.lengths[None], 2.0)
-    np.testing.assert_allclose(middle, 0)
-    # cut at its very start: the lower half of a slab of 4 mm is empty, its metal's middle is 1 mm above the mid-plane
-    np.testing.assert_allclose(rod_end_shift(model, slope, np.zeros((1, 6)), 2.0), 1.0)
-    np.testing.assert_allclose(rod_end_shift(model, slope, model.lengths[None], 2.0), 1.0)
-    just_whole = 2.0 / rise * np.ones((1, 6))
-    np.testing.assert_allclose(rod_end_shift(model, slope, just_whole, 2.0), 0, atol=1e-12)
+def metal_in_slab(z_end: float, tangent: float, radius: float, half_slab: float) -> tuple[float, float]:
+    """Of a rod that comes from below and ends at ``z_end``: its mean, as mm of z along the rod, and its share.
+
+    Discs of the slab, each cut by the end's face, which is square to the rod; summed up point by point.
+    """
+    cosine = 1 / np.hypot(1, tangent)
+    z = np.linspace(-half_slab, half_slab, 81)[:, None, None]
+    x, y = np.meshgrid(np.linspace(-1, 1, 61) * radius / cosine, np.linspace(-1, 1, 61) * radius)
+    disc = (x * cosine) ** 2 + y**2 <= radius**2 * (1 + 1e-9)
+    below = x * tangent * cosine + z / cosine <= z_end / cosine
+    metal = disc & below
+    return float(((z * tangent + x) * metal).sum() / max(metal.sum(), 1) / tangent), float(metal.mean() / disc.mean())
+
+
+@pytest.mark.parametrize("diameter_mm", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("tangent", [0.05, 0.3, 0.8])
+@pytest.mark.parametrize("half_slab", [0.4, 1.5])
+def test_what_the_end_of_a_rod_does_to_its_spot_is_charged(
+    diameter_mm: float, tangent: float, half_slab: float
+) -> None:
+    rods = tuple(
+        Rod(id=f"r{i}", start=[20.0 * i, 0, 0], end=[20.0 * i, 0, 60], diameter_mm=diameter_mm) for i in range(3)
+    )
+    model = RodModel(name="ends", rods=rods)
+    slope = np.tile([0.6 * tangent, 0.8 * tangent], (3, 1))
+    per_height = np.hypot(1, tangent)
+    for z_end in np.linspace(-1, 1, 21) * (half_slab + 0.6 * diameter_mm):
+        shift, share = metal_in_slab(z_end, tangent, diameter_mm / 2, half_slab)
+        at_end = rod_end_shift(model, slope, np.full(3, 60 - z_end * per_height), half_slab)
+        np.testing.assert_allclose(rod_end_shift(model, slope, np.full(3, z_end * per_height), half_slab), at_end)
+        if share > 0.5:
+            assert abs(shift) < 1.05 * at_end[0] + 1e-9, z_end
+        elif share > 1 / 3:
+            assert abs(shift) < 1.4 * at_end[0], z_end
+        # also as it is seen from a pose that the shift of rods that end together has moved
+        if share > 0.5:
+            moved = rod_end_shift(model, slope, np.full(3, 60 - (z_end + abs(shift)) * per_height), half_slab)
+            assert abs(shift) < 2.0 * moved[0] + 1e-9, z_end
+    face = 0.5 * diameter_mm / 2 * min(1.0, 0.5 * diameter_mm * tangent / per_height / half_slab) / tangent
+    far = (2 * half_slab + face + diameter_mm / 2 * tangent / per_height + 1e-9) * per_height
+    np.testing.assert_array_equal(rod_end_shift(model, slope, np.full(3, far), half_slab), 0.0)
+    np.testing.assert_array_equal(rod_end_shift(model, slope, np.full(3, 30.0), half_slab), 0.0)
 
 
 def test_weights_follow_the_spots_covariances() -> None:
