@@ -18,6 +18,7 @@ from ctreg_cli.imaging.uncertainty import (
     KEPT,
     centre_covariance,
     even_variance,
+    noise_at_floor,
     noise_field,
     odd_variance,
     responses,
@@ -125,6 +126,9 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
     if len(long):
         influence = long.turned_back(influence)
     rough, smooth, length = noise_field(fitted.residuals, fitted.quiet, radius)
+    hidden = noise_at_floor(fitted.residuals, fitted.rows.values, fitted.quiet, fitted.height)
+    hidden[fitted.n_clipped > 0] = 0.0  # what the fit leaves there is the edge's, and counts by itself
+    rough, smooth = np.maximum(rough, hidden), np.maximum(smooth, hidden)
     response = responses(influence, radius, length)
     least = _of_pixels(fitted)[:, None, None] * np.eye(2)
     cut = np.flatnonzero(fitted.n_clipped)

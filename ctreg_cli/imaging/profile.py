@@ -144,6 +144,11 @@ class Rows:
         return self._areas is not None or self.flat
 
     @property
+    def values(self) -> FloatArray:
+        """(k, p) of the pixels."""
+        return self._values
+
+    @property
     def cut_off(self) -> BoolArray:
         """(k,) whether pixels of a spot are clipped."""
         if self._clipped is None:

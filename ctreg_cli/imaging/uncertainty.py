@@ -29,6 +29,11 @@ MEDIAN_LOSS = 2.33
 ROUNDING_SD = float(1.0 / np.sqrt(12.0))
 #: what the ring holds counts as structure only beyond so many times the variance that its noise may seem to have
 RING_NOISE = 1.3
+#: surroundings of which a larger share holds their least value are cut off there
+FLOOR_SHARE = 1 / 3
+#: parameters of a profile that the pixels of a spot above the floor determine; what they show of noise is taken so many
+#: times, since neighbours may share it; and in spot heights the most that it is taken to be
+FITTED, FLOOR_SHARED, MOST_AT_FLOOR = 8, 1.5, 0.1
 #: noise is looked at in at most so many pixels of a window
 NOISE_SAMPLES = 256
 #: correlation lengths of noise that are told apart, px
@@ -97,6 +102,29 @@ def noise_field(residuals: FloatArray, quiet: BoolArray, radius: int) -> tuple[F
     fine_gain, coarse_gain = _laplacian_gains()
     length = float(np.interp(np.sort(coarse / fine)[(k - 1) // 2], coarse_gain / fine_gain, NOISE_LENGTHS_PX))
     return fine, fine / np.interp(length, NOISE_LENGTHS_PX, fine_gain), length
+
+
+def noise_at_floor(residuals: FloatArray, values: FloatArray, quiet: BoolArray, height: FloatArray) -> FloatArray:
+    """Sd (k,) of the noise of spots whose surroundings are cut off below; 0 where they are not.
+
+    Air at the least value that an image can hold (−1024 HU, 0 in a PNG) shows no noise, the spot has it all the same.
+    It is then what the fit left in the pixels above; neighbours share some of it, unseen.
+
+    Args:
+        residuals: (k, p), at the pixels of the disc.
+        values: (k, p) of the pixels.
+        quiet: (k, p), where noise would be looked for.
+        height: (k,) of the spots.
+    """
+    at_floor = (values <= np.where(quiet, values, np.inf).min(axis=1, keepdims=True)) & quiet
+    cut = np.count_nonzero(at_floor, axis=1) > FLOOR_SHARE * np.count_nonzero(quiet, axis=1)
+    result = np.zeros(len(values))
+    for k in np.flatnonzero(cut):
+        above = residuals[k, values[k] > values[k, at_floor[k]][0]]
+        free = len(above) - FITTED
+        seen = FLOOR_SHARED * float(np.sqrt((above**2).sum() / free)) if free > 0 else np.inf
+        result[k] = min(seen, MOST_AT_FLOOR * height[k])
+    return result
 
 
 @cache

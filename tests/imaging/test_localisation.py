@@ -244,3 +244,23 @@ def test_tissue_s_texture_about_a_dark_spot_is_owned_up_to(length_px: float) -> 
         error, covariance = errors(spots, uv)
         own.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2)
     assert 0.6 < np.concatenate(own).mean() < 1.5
+
+
+@pytest.mark.parametrize("case", ["air at the floor", "air beneath it", "soft kernel", "a PNG's black"])
+def test_where_the_surroundings_are_cut_off_below_noise_is_not_taken_for_none(case: str) -> None:
+    """Air at the least value that the image can hold shows no noise: the spot has it all the same."""
+    rng, chi2 = np.random.default_rng([47, len(case)]), []
+    for _ in range(2):
+        image, uv = render_grid(rng, 6, 30, contrast=2500.0, mm_per_px=1.0 if case == "a PNG's black" else 0.5)
+        field = rng.normal(0.0, 1.0, image.shape)
+        if case == "soft kernel":
+            field = gaussian_filter(field, 0.6)
+        beneath = 60.0 if case == "air beneath it" else 25.0
+        values = np.maximum(image - beneath + 20.0 * field / field.std(), 0.0)
+        slice_ = as_slice(values / 10.0, dtype=np.uint8) if case == "a PNG's black" else as_slice(values)
+        found = find_spots(slice_)
+        nearest = np.linalg.norm(found.uv_px[:, None] - uv, axis=2).argmin(axis=0)
+        error = found.uv_px[nearest] - uv
+        assert np.abs(error).max() < 1.0
+        chi2.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_px[nearest]), error) / 2)
+    assert 0.3 < np.mean(chi2) < 2.0
