@@ -9,10 +9,12 @@ the pose, both weighted, what is left of K beside J is ``K' = K − J (JᵀJ)⁻
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.special import chdtrc
 
-from ctreg_cli.arrays import FloatArray
+from ctreg_cli.arrays import FloatArray, frozen
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.registration.linearity import positive_part
@@ -25,8 +27,6 @@ SUSPECT_P = 1e-2
 CERTAIN_P = 1e-9
 #: ... if that error then explains the spots at least so well
 _EXPLAINED_P = 1e-3
-#: relative step of the numeric derivative with respect to the frame's height
-_STEP = 1e-4
 #: how far off (relative sd) a scale or a height may be
 RELATIVE_SD = 0.05
 
@@ -52,7 +52,9 @@ def covariance_with_misfit(
     root = np.swapaxes(np.linalg.cholesky(fit.weight[0, used]), 1, 2)
     r = (root @ fit.residual_px[0, used, :, None]).reshape(-1)
     J = (root @ fit.jacobian[0, used]).reshape(-1, 6)
-    K = (root @ _derivatives(model, T, seen.mm_per_px)[used]).reshape(len(r), -1)
+    crossing = project(T, model.starts, model.directions)
+    K = hidden_derivatives(model, T, crossing.xy_mm[used], crossing.slope[used]) / seen.mm_per_px[:, None]
+    K = (root @ K).reshape(len(r), -1)
     J_plus = np.linalg.pinv(J)
     r_beside, beside = r - J @ (J_plus @ r), K - J @ (J_plus @ K)
     # the prior as three more observations: what the pose can imitate is then off by a few percent, not by half
@@ -95,20 +97,29 @@ def _spread_by_scale(model: RodModel, T: FloatArray, covariance: FloatArray, see
     return result
 
 
-def _derivatives(model: RodModel, T: FloatArray, mm_per_px: FloatArray) -> FloatArray:
-    """(n, 2, 3) change of the predicted spots, px, with the relative error of both scales and of the frame's height."""
-    crossing = project(T, model.starts, model.directions).xy_mm
-    axis = np.linalg.svd(model.directions)[2][0]
-    ends = model.starts + model.lengths[:, None] * model.directions
+def hidden_derivatives(model: RodModel, T: FloatArray, xy_mm: FloatArray, slope: FloatArray) -> FloatArray:
+    """(n, 2, 3) change of predicted spots, mm, with the relative error of both scales and of the frame's height.
 
-    def taller(points: FloatArray) -> FloatArray:
-        result: FloatArray = points + _STEP * ((points - model.centre) @ axis)[:, None] * axis
-        return result
+    A taller frame moves what lies at a crossing by ``δ = h a`` along its axis ``a``, ``h`` as far as it lies above the
+    frame's centre; the rod through it then crosses the slice ``δ_xy − slope · δ_z`` farther.
 
-    along = taller(ends) - taller(model.starts)
-    moved = project(T, taller(model.starts), along / np.linalg.norm(along, axis=1, keepdims=True)).xy_mm
-    K = np.zeros((len(model), 2, 3))
-    K[:, 0, 0], K[:, 1, 1] = -crossing[:, 0], -crossing[:, 1]
-    K[:, :, 2] = (moved - crossing) / _STEP
-    result: FloatArray = np.nan_to_num(K) / mm_per_px[:, None]
-    return result
+    Args:
+        model: the rods.
+        T: (4, 4) the pose.
+        xy_mm: (n, 2) where rods are crossed, mm.
+        slope: (n, 2) of the rods.
+    """
+    turn = T[:3, :3]
+    axis, centre = turn.dot(_tall_axis(model)), turn.dot(model.centre) + T[:3, 3]
+    height = (xy_mm - centre[:2]).dot(axis[:2]) - centre[2] * axis[2]
+    K = np.zeros((len(xy_mm), 2, 3))
+    np.negative(xy_mm[:, 0], out=K[:, 0, 0])
+    np.negative(xy_mm[:, 1], out=K[:, 1, 1])
+    np.multiply(height[:, None], axis[:2] - slope * axis[2], out=K[:, :, 2])
+    return K
+
+
+@lru_cache(maxsize=16)
+def _tall_axis(model: RodModel) -> FloatArray:
+    """(3,) the rods' common direction, more or less; cached, since a model is a value that never changes."""
+    return frozen(np.linalg.svd(model.directions)[2][0], (3,))

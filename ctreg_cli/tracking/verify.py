@@ -21,6 +21,7 @@ from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
 from ctreg_cli.registration.integrity import protected_points
 from ctreg_cli.registration.matching import Scene
+from ctreg_cli.registration.misfit import RELATIVE_SD, hidden_derivatives
 from ctreg_cli.registration.options import RegistrationOptions
 from ctreg_cli.registration.register import (
     ACCEPT_LOG_ODDS,
@@ -66,6 +67,10 @@ _SURPRISE_SD = 4.0
 _ODD_INNOVATION2 = 30.0
 #: crossings closer than this (in rod diameters, or of the frame's size where there are none) may leave one spot
 _TOUCHING_DIAMETERS, _TOUCHING_SIZE = 2.0, 0.05
+#: a score beyond this (χ² of three degrees of freedom: 3 in 1,000) may be a scale or a height that is off; the looser
+#: test of a registration would have one sure slice in a hundred looked into for nothing
+MISFIT_SCORE = 13.9
+_SCALES_PRIOR = np.eye(3) / RELATIVE_SD**2
 #: a spot fixes a direction alone when the others predict it with this share of certainty (of areas) or less
 _FIXES_ALONE = 1e-9
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
@@ -120,6 +125,8 @@ def verified(
         return None
     innovation = mahalanobis2(difference(T, T_predicted), predicted_covariance + C)
     if innovation[0] > _ODD_INNOVATION2:
+        return None
+    if _hides_a_misfit(model, moved):
         return None
     odds = _log_odds(model, scene, crossings.xy_mm, moved, without, rods, missing, innovation)
     if not odds > ACCEPT_LOG_ODDS:
@@ -333,6 +340,21 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
     a, b, c = (without.gate[:, i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     near = (c * d_x - (b + b) * d_y) * d_x + a * d_y * d_y < CONTEST_D2 * without.gate_det[:, None]
     return int(np.count_nonzero(near)) > k
+
+
+def _hides_a_misfit(model: RodModel, moved: ServoResult) -> bool:
+    """Whether the spots speak of a scale or a frame's height that is off: the score test of registration.
+
+    See :mod:`~ctreg_cli.registration.misfit`; in closed form, the spots in millimetres.
+    """
+    seen = moved.view
+    k = len(seen.residual_px)
+    K = hidden_derivatives(model, moved.T, seen.crossing.xy_mm, seen.crossing.slope)
+    WK = (seen.weight @ K).reshape(2 * k, 3)
+    JWK = seen.jacobian.T.dot(WK)
+    information = K.reshape(2 * k, 3).T.dot(WK) - JWK.T.dot(moved.covariance.dot(JWK)) + _SCALES_PRIOR
+    pull = seen.residual_px.reshape(-1).dot(WK)
+    return bool(float(pull.dot(np.linalg.solve(information, pull))) > MISFIT_SCORE)
 
 
 def _log_odds(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
+from ctreg_cli.registration.misfit import hidden_derivatives
 from ctreg_cli.registration.register import register
 from ctreg_cli.registration.result import Registration
 from ctreg_cli.scale import Scale
-from tests.oracle import OracleFrame, OracleScene, random_frame, twist_error
+from tests.oracle import OracleFrame, OracleScene, cross_lines, random_frame, twist_error
 from tests.registration.frames import frame_of, model_of, on_its_mount, some_scene
 
 NOISE_PX = 0.1
@@ -86,3 +88,26 @@ def test_a_right_drawing_is_rarely_suspected() -> None:
         suspected += any(name == "misfit" for name, _ in result.warnings)
     # one in a hundred by design: five of thirty have a probability of 1e-5
     assert suspected < 5
+
+
+def test_derivatives_with_scales_and_height_are_differences_of_crossings() -> None:
+    rng = np.random.default_rng(944)
+    frame = random_frame(rng, 8)
+    world = some_scene(rng, frame, sd_px=0.1, least=8)
+    model = model_of(frame)
+    axis = np.linalg.svd(model.directions)[2][0]
+    lines = cross_lines(model.starts, model.ends, world.R, world.t)
+    slope = (model.directions @ world.R.T)[:, :2] / (model.directions @ world.R.T)[:, 2:]
+    K = hidden_derivatives(model, poses.make_pose(world.R, world.t), lines, slope)
+
+    def taller(points: np.ndarray, share: float) -> np.ndarray:
+        return points + share * ((points - model.centre) @ axis)[:, None] * axis
+
+    high, low = (
+        cross_lines(taller(model.starts, share), taller(model.ends, share), world.R, world.t) for share in (1e-4, -1e-4)
+    )
+    np.testing.assert_allclose(K[:, :, 2], (high - low) / 2e-4, atol=1e-5)
+    np.testing.assert_array_equal(K[:, 0, 0], -lines[:, 0])
+    np.testing.assert_array_equal(K[:, 1, 1], -lines[:, 1])
+    assert not K[:, 0, 1].any()
+    assert not K[:, 1, 0].any()

@@ -63,6 +63,21 @@ def test_rods_missing_and_spots_false(kind: str, strategy: str) -> None:
     assert np.sqrt(np.mean(squares)) < 1.3  # of some 20 slices; over 6000: 1.00 (benchmarks/tracking.py)
 
 
+def test_a_scale_that_is_off_is_suspected_in_tracked_slices_as_in_others() -> None:
+    """By 0.3 % along one axis: a pose hides most of it."""
+    suspected = {pipeline.pose: 0, pipeline.track: 0}
+    for seed in (1, 4):
+        made = clean("drift", n=20, seed=seed)
+        scales = [replace(item.info.scale, s_y=1.003 * item.info.scale.s_y) for item in made.slices]
+        pairs = zip(made.slices, scales, strict=True)
+        slices = [replace(item, info=replace(item.info, scale=scale)) for item, scale in pairs]
+        for method in suspected:
+            for result in method(slices, made.model):
+                suspected[method] += result.status == "ok" and "misfit" in dict(result.warnings)
+    assert suspected[pipeline.pose] > 15
+    assert suspected[pipeline.track] > 0.75 * suspected[pipeline.pose]
+
+
 @pytest.mark.parametrize("strategy", ["updated", "constant"])
 def test_the_method_says_how_a_pose_was_found(strategy: str) -> None:
     results = track(clean(), jacobian=strategy)
