@@ -44,6 +44,7 @@ _UNIT_MATRIX = np.eye(N_PARAMETERS)
 MAX_CHANGE = _per_parameter(centre=2.0, log_height=2.0, background=np.inf, shape=2.0, flatness=np.inf)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a fit that wanders off goes back, or is none
 def fit(rows: Rows, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Parameters (10, k) and normal matrices (k, 10, 10) at the minima of Σ w r² plus weak priors on the shape.
 

@@ -306,9 +306,10 @@ def steepness(parameters: FloatArray, long: BoolArray, ceiling: float) -> tuple[
     width = np.exp(-np.maximum(parameters[SHAPE][0], parameters[SHAPE][2]))
     beta = np.where(long, LONG_BETA, np.exp(parameters[FLATNESS]))
     at_edge = np.log(2.0) * beta / width
-    # 2^(−q^β) is the ceiling over the height where q^β is this
+    # 2^(−q^β) is the ceiling over the height where q^β is this; a profile with a peak (β < ½) is infinitely steep there
     at_ceiling = (parameters[LOG_HEIGHT] - np.log(np.maximum(ceiling - parameters[BACKGROUND], 1e-9))) / np.log(2.0)
-    return at_edge, at_edge * 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
+    with np.errstate(divide="ignore"):
+        return at_edge, at_edge * 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
 
 
 def distance_beyond_edge(moments: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
