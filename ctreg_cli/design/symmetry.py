@@ -42,14 +42,7 @@ def symmetries(model: RodModel, *, within_mm: float, mirrored: bool = False) -> 
     mirror = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
     source = _move(mirror, ends.reshape(-1, 3)).reshape(n, 2, 3)
     a, b = _reference_pair(model)
-    i, j = (index.ravel() for index in np.nonzero(~np.eye(n, dtype=bool)))
-    pairs = np.concatenate(
-        [
-            np.concatenate([ends[i][:, ::flip_i], ends[j][:, ::flip_j]], axis=1)
-            for flip_i in (1, -1)
-            for flip_j in (1, -1)
-        ]
-    )  # (4 n (n − 1), 4, 3)
+    pairs = _ordered_pairs(ends)
     reference = np.concatenate([source[a], source[b]])
     # two rods fix the rest loosely where they are short or close: allow for it here, and measure properly below
     slack_mm = 2 * within_mm
@@ -75,6 +68,72 @@ def symmetries(model: RodModel, *, within_mm: float, mirrored: bool = False) -> 
                 deviation_mm=deviation,
             )
     return tuple(sorted(found.values(), key=lambda symmetry: (round(symmetry.deviation_mm, 9), symmetry.angle_deg)))
+
+
+def partial_symmetries(
+    model: RodModel, *, within_mm: float, least: int, mirrored: bool = False
+) -> tuple[tuple[FloatArray, IntArray], ...]:
+    """Motions, but for the identity, that map ``least`` rods or more onto rods to ``within_mm``, the closest first.
+
+    A box has panels that are alike: where a slice shows rods of two of them only, it has two poses. Every pair of rods
+    is tried on every ordered pair, where the distances of their ends allow it.
+
+    Args:
+        model: the rods.
+        within_mm: greatest distance between an end of a moved rod and the end it comes to.
+        least: how many rods.
+        mirrored: whether to map them onto the mirror image, as in :func:`symmetries`.
+
+    Returns:
+        Transforms (4, 4), and (n,) the rod that each comes to lie on, −1 for none.
+    """
+    n = len(model)
+    ends = np.stack([model.starts, model.ends], axis=1)
+    mirror = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0, 1.0])
+    source = _move(mirror, ends.reshape(-1, 3)).reshape(n, 2, 3)
+    pairs = _ordered_pairs(ends)
+    between = _distances(pairs)
+    found: dict[bytes, tuple[float, FloatArray, IntArray]] = {}
+    for a, b in zip(*np.triu_indices(n, 1), strict=True):
+        reference = np.concatenate([source[a], source[b]])
+        alike = np.abs(between - _distances(reference[None])).max(axis=1) < 4 * within_mm
+        for T in _fit(reference, pairs[alike]):
+            for _ in range(2):  # on all that it takes along
+                image, flipped = _images(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3), ends)
+                target = np.where(flipped[:, None, None], ends[image][:, ::-1], ends[image])
+                off = np.linalg.norm(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3) - target, axis=-1).max(axis=-1)
+                taken = np.flatnonzero(off < 2 * within_mm)
+                if len(taken) < least:
+                    break
+                T = _fit(source[taken].reshape(-1, 3), target[taken].reshape(1, -1, 3))[0]
+            off = np.linalg.norm(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3) - target, axis=-1).max(axis=-1)
+            mapped = off <= within_mm
+            if mapped.sum() < least or len(set(image[mapped].tolist())) < mapped.sum():
+                continue
+            if not mirrored and rotation_angle(T[:3, :3]) <= MIN_ANGLE_RAD and np.linalg.norm(T[:3, 3]) <= within_mm:
+                continue
+            image = np.where(mapped, image, -1)
+            key = image.tobytes() + flipped[mapped].tobytes()
+            found.setdefault(key, (round(float(off[mapped].max()), 9), T @ mirror, image))
+    return tuple((T, image) for _, T, image in sorted(found.values(), key=lambda each: each[0]))
+
+
+def _ordered_pairs(ends: FloatArray) -> FloatArray:
+    """(4 n (n − 1), 4, 3) the ends of each two rods (n, 2, 3), in either order, each either way round."""
+    i, j = (index.ravel() for index in np.nonzero(~np.eye(len(ends), dtype=bool)))
+    return np.concatenate(
+        [
+            np.concatenate([ends[i][:, ::flip_i], ends[j][:, ::flip_j]], axis=1)
+            for flip_i in (1, -1)
+            for flip_j in (1, -1)
+        ]
+    )
+
+
+def _distances(points: FloatArray) -> FloatArray:
+    """(k, 6) between each two of four points (k, 4, 3)."""
+    i, j = np.triu_indices(4, 1)
+    return np.asarray(np.linalg.norm(points[:, i] - points[:, j], axis=-1))
 
 
 def _reference_pair(model: RodModel) -> tuple[int, int]:

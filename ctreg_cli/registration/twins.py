@@ -13,16 +13,20 @@ from functools import lru_cache
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray, IntArray
-from ctreg_cli.design.symmetry import symmetries
+from ctreg_cli.design.symmetry import partial_symmetries, symmetries
 from ctreg_cli.registration.matching import Matches, Scene, join, verify, weigh
 from ctreg_cli.rods import RodModel
 
 #: motions that take the rods onto each other as nearly as this (in frame sizes) make a twin worth looking at
 _SYMMETRIC_WITHIN = 0.05
+#: ... of a part of them; panels of a box are alike as they were drawn
+_ALIKE_WITHIN = 0.02
 #: so many rods that map onto each other are a symmetry and no chance; so many spots determine a pose
 _LEAST_SYMMETRIC, _LEAST_DETERMINED = 5, 3
 #: rods up to which twins are looked for: symmetries are sought in all pairs
 _MOST_RODS = 24
+#: ... and twins of a part of the frame: these are sought from all pairs; so many are looked at
+_MOST_PARTIAL, _MOST_PARTIAL_TWINS = 12, 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,6 +62,22 @@ def twins(model: RodModel, *, mirrored: bool = False) -> tuple[Twin, ...]:
     return tuple(found)
 
 
+@lru_cache(maxsize=32)
+def partial_twins(model: RodModel, *, mirrored: bool = False) -> tuple[Twin, ...]:
+    """Motions that map five rods or more onto rods, beside those of :func:`twins`; cached likewise.
+
+    Two panels of a box are alike: a slice that shows their rods alone has two poses.
+    """
+    if len(model) > _MOST_PARTIAL:
+        return ()
+    known = {twin.image.tobytes() for twin in twins(model, mirrored=mirrored)}
+    alike = partial_symmetries(
+        model, within_mm=_ALIKE_WITHIN * model.size_mm, least=_LEAST_SYMMETRIC, mirrored=mirrored
+    )
+    others = [Twin(transform=T, image=image) for T, image in alike if image.tobytes() not in known]
+    return tuple(others[:_MOST_PARTIAL_TWINS])
+
+
 def with_twins(model: RodModel, scene: Scene, matches: Matches, least_matches: int) -> Matches:
     """``matches`` and, for the best of them, what each twin of the frame makes of it.
 
@@ -65,7 +85,8 @@ def with_twins(model: RodModel, scene: Scene, matches: Matches, least_matches: i
     that of i. The odd rod, if any, then asks for a spot where the pose puts it. Of a mirror image M it makes Z T M, Z
     the mirror in the slice, which leaves the spots where they are.
     """
-    proper, mirrored = twins(model), twins(model, mirrored=True)
+    proper = (*twins(model), *partial_twins(model))
+    mirrored = (*twins(model, mirrored=True), *partial_twins(model, mirrored=True))
     symmetric = (*proper, *mirrored)
     if not symmetric:
         return matches
