@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -150,3 +151,9 @@ class RodModel:
             description=self.description,
             sha256=self.sha256,
         )
+
+
+@lru_cache(maxsize=16)
+def common_direction(model: RodModel) -> FloatArray:
+    """(3,) that the rods have in common, more or less; cached, since a model is a value that never changes."""
+    return frozen(np.linalg.svd(model.directions)[2][0], (3,))

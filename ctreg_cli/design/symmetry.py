@@ -57,7 +57,7 @@ def symmetries(model: RodModel, *, within_mm: float, mirrored: bool = False) -> 
             continue
         target = np.where(flipped[:, None, None], ends[image][:, ::-1], ends[image])
         best = _fit(source.reshape(-1, 3), target.reshape(1, -1, 3))[0]
-        deviation = float(np.linalg.norm(_move(best, source.reshape(-1, 3)) - target.reshape(-1, 3), axis=-1).max())
+        deviation = float(_deviations(best, source, target).max())
         angle = float(rotation_angle(best[:3, :3]))
         if deviation <= within_mm and (mirrored or angle > MIN_ANGLE_RAD):
             found[key] = Symmetry(
@@ -101,12 +101,11 @@ def partial_symmetries(
             for _ in range(2):  # on all that it takes along
                 image, flipped = _images(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3), ends)
                 target = np.where(flipped[:, None, None], ends[image][:, ::-1], ends[image])
-                off = np.linalg.norm(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3) - target, axis=-1).max(axis=-1)
-                taken = np.flatnonzero(off < 2 * within_mm)
+                taken = np.flatnonzero(_deviations(T, source, target) < 2 * within_mm)
                 if len(taken) < least:
                     break
                 T = _fit(source[taken].reshape(-1, 3), target[taken].reshape(1, -1, 3))[0]
-            off = np.linalg.norm(_move(T, source.reshape(-1, 3)).reshape(n, 2, 3) - target, axis=-1).max(axis=-1)
+            off = _deviations(T, source, target)
             mapped = off <= within_mm
             if mapped.sum() < least or len(set(image[mapped].tolist())) < mapped.sum():
                 continue
@@ -159,6 +158,12 @@ def _fit(points: FloatArray, targets: FloatArray) -> FloatArray:
 
 def _move(T: FloatArray, points: FloatArray) -> FloatArray:
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def _deviations(T: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
+    """(n,) greatest distance of the ends of moved rods (n, 2, 3) from those they come to."""
+    moved = _move(T, source.reshape(-1, 3)).reshape(source.shape)
+    return np.asarray(np.linalg.norm(moved - target, axis=-1).max(axis=-1))
 
 
 def _images(moved: FloatArray, ends: FloatArray) -> tuple[IntArray, IntArray]:

@@ -191,6 +191,7 @@ class Follower:
         self._waits[rod] = waited, waited
         return True
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # steps that wander off are not relied on
     def _follow(self, windows: _Windows, known: _Known, uv: FloatArray, radius: FloatArray) -> tuple[Spots, BoolArray]:
         """Spots of those known rods (k,) that a step from what is known measures, and which rods these are."""
         middles, values, brightest, good = windows.about(uv, known)

@@ -112,9 +112,9 @@ class FileSlice(Slice):
             has been taken away or cut short in the meantime.
     """
 
-    __slots__ = ("_in_file", "_whole")
-    _in_file: StoredRows | None
-    _whole: NDArray[Any] | None
+    __slots__ = ("_pixels",)
+    #: what reads them, and once they have been read, they themselves
+    _pixels: StoredRows | NDArray[Any]
 
     def __init__(
         self,
@@ -127,14 +127,12 @@ class FileSlice(Slice):
     ) -> None:
         """See :class:`Slice`; ``stored`` reads integers, or has been read."""
         _check_rescale(slope, intercept)
-        is_read = isinstance(stored, np.ndarray)
         keep = object.__setattr__  # the class is frozen
         keep(self, "info", info)
         keep(self, "slope", slope)
         keep(self, "intercept", intercept)
         keep(self, "padding", padding)
-        keep(self, "_in_file", None if is_read else stored)
-        keep(self, "_whole", stored if is_read else None)
+        keep(self, "_pixels", stored)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process gets the pixels, not the file."""
@@ -143,18 +141,16 @@ class FileSlice(Slice):
     @property
     def stored(self) -> NDArray[Any]:
         """(rows, columns) as stored; treat as read-only."""
-        whole, in_file = self._whole, self._in_file
-        if whole is None:
-            assert in_file is not None
-            whole = in_file.whole()
-            object.__setattr__(self, "_whole", whole)
-        return whole
+        pixels = self._pixels
+        if not isinstance(pixels, np.ndarray):
+            pixels = pixels.whole()
+            object.__setattr__(self, "_pixels", pixels)
+        return pixels
 
     def rows(self, first: int, end: int) -> NDArray[Any]:
         """See :meth:`Slice.rows`."""
-        if self._whole is not None or self._in_file is None:
-            return self.stored[first:end]
-        return self._in_file.rows(first, end)
+        pixels = self._pixels
+        return pixels[first:end] if isinstance(pixels, np.ndarray) else pixels.rows(first, end)
 
 
 def _slice(

@@ -187,14 +187,11 @@ class NativePixels:
     def whole(self) -> NDArray[Any]:
         """Read the frame; the array is read-only."""
         layout, count = self.layout, self.layout.rows * self.layout.columns
-        dtype = layout.dtype.newbyteorder("<" if self.little_endian else ">")
-        if self.swapped_words:
-            start = self.offset - self.offset % 2  # words begin at even places, in the file as in DICOM's values
-            words = self._read(np.dtype("u2"), (self.offset - start + count + 1) // 2, start)
-            stored = words.byteswap().view(dtype)[self.offset - start :][:count]
-        else:
-            stored = self._read(dtype, count, self.offset)
-        return _finished(stored, layout)
+        if not self.swapped_words:
+            return self.rows(0, layout.rows)
+        start = self.offset - self.offset % 2  # words begin at even places, in the file as in DICOM's values
+        words = self._read(np.dtype("u2"), (self.offset - start + count + 1) // 2, start)
+        return _finished(words.byteswap().view(layout.dtype)[self.offset - start :][:count], layout)
 
     def rows(self, first: int, end: int) -> NDArray[Any]:
         """Read some rows, from ``first`` to before ``end``; the array is read-only."""

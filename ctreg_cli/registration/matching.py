@@ -37,7 +37,7 @@ from ctreg_cli.registration.refine import (
     invert_2x2,
     refine,
 )
-from ctreg_cli.rods import RodModel
+from ctreg_cli.rods import RodModel, common_direction
 
 #: a vote must lie within this Mahalanobis distance² of the prediction (two degrees of freedom: 1 in 30,000 lost)
 _GATE2 = 20.0
@@ -218,8 +218,7 @@ def plan_among(model: RodModel, scene: Scene) -> SearchPlan:
 def _triple_strength(model: RodModel, triples: IntArray) -> FloatArray:
     """|det J|^(1/6) of each triple's motion field, median over tilts about the frame's own axis and all heights."""
     rng = np.random.default_rng(20081)  # a fixed design of poses, not an experiment
-    axis = np.linalg.svd(model.directions)[2][0]  # the rods' common direction, more or less
-    normal = poses.nearest_rotation(_basis_along(axis))
+    normal = poses.nearest_rotation(_basis_along(common_direction(model)))
     tilt = poses.exp_rotation(rng.normal(size=(48, 3)) * 0.25)
     R = tilt @ normal
     middle = np.concatenate([model.starts, model.ends])
@@ -519,9 +518,10 @@ def _vote(
     J_own, J = J[row, rods], J[row, others]
     WJ = (invert_2x2(own) @ J_own).reshape(b, 6, 6)
     unit = np.array([size] * 3 + [1.0] * 3)
-    information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + np.diag(unit**-2.0)
+    prior = np.diag(unit**-2.0)
+    information = np.swapaxes(J_own.reshape(b, 6, 6), 1, 2) @ WJ + prior
     # of spots known to a millionth of a pixel one direction may be all that rounding leaves
-    information += (_ROUNDING * np.einsum("bii,i->b", information, unit * unit))[:, None, None] * np.diag(unit**-2.0)
+    information += (_ROUNDING * np.einsum("bii,i->b", information, unit * unit))[:, None, None] * prior
     JC = (J.reshape(b, -1, 6) @ np.linalg.inv(information)).reshape(J.shape)
     gate = JC @ np.swapaxes(J, -1, -2) + tolerance[row, others] + np.median(scene.covariance_mm, axis=0)
     r = np.where(hopeful[..., None], scene.xy_mm[nearest] - projection.xy_mm[row, others], 0)

@@ -9,17 +9,15 @@ the pose, both weighted, what is left of K beside J is ``K' = K − J (JᵀJ)⁻
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from scipy.special import chdtrc
 
-from ctreg_cli.arrays import FloatArray, frozen
+from ctreg_cli.arrays import FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.projection import project
 from ctreg_cli.registration.linearity import positive_part
 from ctreg_cli.registration.refine import Observations, linearise, refine_scales
-from ctreg_cli.rods import RodModel
+from ctreg_cli.rods import RodModel, common_direction
 
 #: a score less likely than this by chance is taken for an error of scale or height ...
 SUSPECT_P = 1e-2
@@ -110,16 +108,10 @@ def hidden_derivatives(model: RodModel, T: FloatArray, xy_mm: FloatArray, slope:
         slope: (n, 2) of the rods.
     """
     turn = T[:3, :3]
-    axis, centre = turn.dot(_tall_axis(model)), turn.dot(model.centre) + T[:3, 3]
+    axis, centre = turn.dot(common_direction(model)), turn.dot(model.centre) + T[:3, 3]
     height = (xy_mm - centre[:2]).dot(axis[:2]) - centre[2] * axis[2]
     K = np.zeros((len(xy_mm), 2, 3))
     np.negative(xy_mm[:, 0], out=K[:, 0, 0])
     np.negative(xy_mm[:, 1], out=K[:, 1, 1])
     np.multiply(height[:, None], axis[:2] - slope * axis[2], out=K[:, :, 2])
     return K
-
-
-@lru_cache(maxsize=16)
-def _tall_axis(model: RodModel) -> FloatArray:
-    """(3,) the rods' common direction, more or less; cached, since a model is a value that never changes."""
-    return frozen(np.linalg.svd(model.directions)[2][0], (3,))

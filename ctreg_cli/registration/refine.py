@@ -132,9 +132,17 @@ UNKNOWN_DIAMETER_MM = 2.0
 
 
 @lru_cache(maxsize=16)
-def rod_radii(model: RodModel) -> FloatArray:
+def _radii(model: RodModel) -> FloatArray:
     """(n,) mm; cached, since a model is a value that never changes."""
     return frozen([0.5 * (rod.diameter_mm or UNKNOWN_DIAMETER_MM) for rod in model.rods], (None,))
+
+
+@lru_cache(maxsize=16)
+def rod_end_reach(model: RodModel, half_slab_mm: float) -> float:
+    """Beyond this, mm of z, no end shifts a spot, however its rod lies; see :func:`rod_end_shift`."""
+    radius = float(_radii(model).max())
+    # a face is half a radius squared over half the slab at most
+    return 2 * half_slab_mm + radius + 0.5 * radius * radius / half_slab_mm
 
 
 def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, half_slab_mm: float) -> FloatArray:
@@ -157,8 +165,8 @@ def rod_end_shift(model: RodModel, slope: FloatArray, lambda_mm: FloatArray, hal
     squared = (slope * slope).sum(axis=-1)
     rise = 1 / np.sqrt(1 + squared)  # mm of z per mm of rod
     tangent = np.sqrt(squared)
-    face_height = rod_radii(model) * tangent * rise  # of half the face, mm
-    face = 0.5 * rod_radii(model) * np.minimum(1.0, face_height / half_slab_mm) / np.maximum(tangent, 1e-9)
+    face_height = _radii(model) * tangent * rise  # of half the face, mm
+    face = 0.5 * _radii(model) * np.minimum(1.0, face_height / half_slab_mm) / np.maximum(tangent, 1e-9)
     reach = 2 * half_slab_mm + face
     beyond = reach + face_height - np.minimum(lambda_mm, model.lengths - lambda_mm) * rise
     result: FloatArray = (half_slab_mm + face) * np.clip(beyond / reach, 0, 1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.registration.matching import MOST_BEYOND_END, Scene, nearest_assignment
-from ctreg_cli.registration.refine import rod_end_shift, rod_radii
+from ctreg_cli.registration.refine import rod_end_reach, rod_end_shift
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.single import Crossing, cross, greatest_tolerance_mm, model_lines
 
@@ -88,10 +88,7 @@ class Outlook:
         half_slab_mm = self.scene.half_slab_mm
         if half_slab_mm == 0:
             return False
-        radius = float(rod_radii(self.model).max())
-        # no shift reaches farther than this: a face is half a radius squared over half the slab at most
-        farthest = 2 * half_slab_mm + radius + 0.5 * radius * radius / half_slab_mm
-        crossing = self.crossing
+        crossing, farthest = self.crossing, rod_end_reach(self.model, half_slab_mm)
         if float((self._to_end_mm / crossing.mm_per_height)[rods].min()) > farthest:  # nearly always
             return False
         return bool(rod_end_shift(self.model, crossing.slope, crossing.lambda_mm, half_slab_mm)[rods].any())
