@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ctreg_cli.arrays import BoolArray, FloatArray, frozen
+from ctreg_cli.arrays import FloatArray, IntArray, frozen
 from ctreg_cli.errors import MissingScaleError, UnreadableSliceError
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.imaging.follow import Follower
@@ -30,7 +30,7 @@ from ctreg_cli.tracking.lasting import lasting_influence
 from ctreg_cli.tracking.motion import StillAxes
 from ctreg_cli.tracking.servo import Desired, view
 from ctreg_cli.tracking.smoother import LEAST_SLICES, TimedPose, smooth
-from ctreg_cli.tracking.tracker import Tracked, Tracker, Velocity
+from ctreg_cli.tracking.tracker import Prediction, Tracked, Tracker, Velocity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -267,7 +267,7 @@ def _followed(
     prediction = None if used is None else tracker.predict(info, used)
     if used is None or prediction is None:
         return None
-    rods = np.flatnonzero(prediction.visible & _inside(prediction.spots_px, info.shape))
+    rods = _rods_to_see(prediction, info.shape)
     spots = follower.measure(slice_, rods, prediction.spots_px.take(rods, axis=0), prediction.radius_px.take(rods))
     tracked = tracker.follow(spots, info, used)
     return None if tracked is None else _tracked_result(place, SpotSlice(info=info, spots=spots), tracker, tracked)
@@ -349,13 +349,12 @@ def _with_pose(result: FrameResult, model: RodModel, pose_: TimedPose, scale: Sc
     )
 
 
-def _inside(uv_px: FloatArray, shape: tuple[int, int] | None) -> BoolArray:
-    """Which predicted spots lie in the image."""
-    if shape is None:
-        shape = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
-    u, v = uv_px.T
-    inside: BoolArray = (u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)
-    return inside
+def _rods_to_see(prediction: Prediction, shape: tuple[int, int] | None) -> IntArray:
+    """The rods that may be seen, and are predicted in the image of this ``shape``."""
+    rows, columns = shape or (math.inf, math.inf)
+    seen = zip(prediction.visible.tolist(), prediction.spots_px.tolist(), strict=True)
+    rods = [rod for rod, (may_be, (u, v)) in enumerate(seen) if may_be and 0 <= u <= columns - 1 and 0 <= v <= rows - 1]
+    return np.array(rods, dtype=np.intp)
 
 
 def _tracked_result(place: int, item: SpotSlice, tracker: Tracker, tracked: Tracked) -> FrameResult:

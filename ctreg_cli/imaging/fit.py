@@ -80,18 +80,19 @@ def _steps(
         prior[FLATNESS, rows.long] = LONG_FLATNESS_PRIOR
     prior_matrix = prior.T[:, :, None] * _UNIT_MATRIX
 
-    def deviation_and_cost(parameters: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def deviation_and_cost(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         deviation = (parameters - start) * unit
-        return prior * deviation, products[:, -1, -1] + np.einsum("ik,ik->k", prior * deviation, deviation)
+        squares = np.einsum("kp,kp->k", rows.by_spot[:, -1], rows.by_spot[:, -1])
+        return prior * deviation, squares + np.einsum("ik,ik->k", prior * deviation, deviation)
 
     products = rows.evaluate(parameters)
-    pull, cost = deviation_and_cost(parameters, products)
+    pull, cost = deviation_and_cost(parameters)
     k = start.shape[1]
     damping, done, stale = np.full(k, FIRST_DAMPING), np.zeros(k, dtype=bool), False
     for _ in range(most):
-        damped = products[:, :-1, :-1] + prior_matrix
+        damped = products[:, :-1] + prior_matrix
         damped *= 1.0 + damping[:, None, None] * _UNIT_MATRIX
-        gradient = products[:, :-1, -1] - pull.T
+        gradient = products[:, -1] - pull.T
         step = np.asarray(np.linalg.solve(damped, gradient[:, :, None])[:, :, 0].T, dtype=np.float64)
         if done.any():
             step[:, done] = 0.0
@@ -110,7 +111,7 @@ def _steps(
             rows.by_spot[:, -1] -= (step.T[:, None] @ rows.by_spot[:, :-1])[:, 0]
             break
         trial_products = rows.evaluate(trial)
-        trial_pull, trial_cost = deviation_and_cost(trial, trial_products)
+        trial_pull, trial_cost = deviation_and_cost(trial)
         better = trial_cost <= cost
         done |= better & small
         stale = not better.all()
@@ -124,4 +125,4 @@ def _steps(
             parameters, pull, products, cost = trial, trial_pull, trial_products, trial_cost
     if stale:
         products = rows.evaluate(parameters)
-    return parameters, products[:, :-1, :-1] + prior_matrix, done
+    return parameters, products[:, :-1] + prior_matrix, done

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import starmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,9 +23,8 @@ from ctreg_cli.imaging.blob import (
     LONE_SHARES,
     LONE_SPREADS,
     Blobs,
-    axes_of,
+    ellipse,
     measure_lone_blobs,
-    moments_of,
     monomials,
 )
 from ctreg_cli.imaging.fit import FLATNESS_RANGE, LONG_FLATNESS_PRIOR, PRIOR
@@ -95,7 +95,6 @@ def _last_step() -> FloatArray:
 
 
 _PRIOR_MATRIX, _LAST_STEP = np.diag(_prior()), _last_step()
-_IS_HEIGHT = np.arange(N_PARAMETERS)[:, None] == LOG_HEIGHT
 
 
 class Follower:
@@ -394,28 +393,40 @@ class _Region(NamedTuple):
     """What of ``k`` windows lies above half height."""
 
     own: BoolArray
-    #: (k,) px², (k, 2) and (k, 2, 2), see :func:`ctreg_cli.imaging.blob.moments_of`
+    #: (k,) px²
     area: FloatArray
+    #: (2, k) from the windows' middles, px, and (3, k), see :func:`~ctreg_cli.imaging.profiles.distance_beyond_edge`
     middle: FloatArray
-    moments: FloatArray
+    edge: FloatArray
     #: (2, k) long and short axis, px; and the angle (k,) of the long one, rad
     axes: FloatArray
     angle: FloatArray
 
     @classmethod
     def of(cls, own: BoolArray) -> _Region:
-        area, middle, moments = moments_of(own, _monomials())
-        long, thick, angle = axes_of(moments)
-        return cls(own=own, area=area, middle=middle, moments=moments, axes=np.array([long, thick]), angle=angle)
+        sums = own.astype(np.float64).dot(_monomials())
+        ellipses = np.array([*starmap(ellipse, sums.tolist())]).T
+        return cls(
+            own=own,
+            area=sums[:, 0].copy(),
+            middle=ellipses[:2],
+            edge=ellipses[2:5],
+            axes=ellipses[5:7],
+            angle=ellipses[7].copy(),
+        )
 
     def is_that_of(self, known: _Known) -> BoolArray:
         """Whether (k,) a spot is as long and thick as it was, and has not become long or round."""
-        change, (long, thick) = self.axes / known.axes, known.axes
-        length_is, thickness_is = (change < MAX_CHANGE) & (change > 1.0 / MAX_CHANGE)
-        same = length_is & thickness_is
-        doubt = np.where(known.long.mask, 1.0 / LONG_DOUBT, LONG_DOUBT) * LONG_RATIO
-        same &= (long > doubt * thick) == known.long.mask
-        return np.asarray(same)
+        is_long = known.long.mask.tolist()
+        return np.array([*map(_is_same_shape, *self.axes.tolist(), *known.axes.tolist(), is_long)])
+
+
+def _is_same_shape(long: float, thick: float, length_was: float, thickness_was: float, is_long: bool) -> bool:
+    """Whether a spot is as long and thick as it was, and had not become long or round by then."""
+    longer, thicker = long / length_was, thick / thickness_was
+    same = 1.0 / MAX_CHANGE < longer < MAX_CHANGE and 1.0 / MAX_CHANGE < thicker < MAX_CHANGE
+    least_ratio = LONG_RATIO / LONG_DOUBT if is_long else LONG_RATIO * LONG_DOUBT
+    return same and (length_was > least_ratio * thickness_was) == is_long
 
 
 class _Looks(NamedTuple):
@@ -472,7 +483,7 @@ def _stepped(
         brightest: (2, k) centres of gravity to start from.
     """
     u, v, _ = _coordinates()
-    distance = distance_beyond_edge(region.moments, u - region.middle[:, :1], v - region.middle[:, 1:])
+    distance = distance_beyond_edge(region.edge, u - region.middle[0, :, None], v - region.middle[1, :, None])
     root_weights = root_pixel_weights(distance, known.noise, known.structure_slope)
     brightest_value = float(values.max())
     ceiling, cut_off = max(known.ceiling, brightest_value), None
@@ -489,16 +500,16 @@ def _stepped(
     parameters = known.parameters.copy()
     parameters[CENTRE] = brightest if long is None else long.turned(brightest)
 
-    # where a spot is cut off, its height may be anything, and moves nothing else
-    limit = _LAST_STEP if cut_off is None else np.where(_IS_HEIGHT & cut, np.inf, _LAST_STEP)
     for n_left in reversed(range(MAX_STEPS)):
         products = rows.evaluate(parameters)
-        normal = products[:, :-1, :-1] + _PRIOR_MATRIX
+        normal = products[:, :-1] + _PRIOR_MATRIX
         normal[:, FLATNESS, FLATNESS] += known.flatness_prior
-        gradient = products[:, -1, :-1]
+        gradient = products[:, -1]
         gradient[:, FLATNESS] -= known.flatness_prior * (parameters[FLATNESS] - known.flatness)
         shift, step = _solved(normal, gradient)
-        small = (np.abs(step) < limit).all(axis=0)
+        few = np.abs(step) < _LAST_STEP
+        few[LOG_HEIGHT] |= cut  # where a spot is cut off, its height may be anything, and moves nothing else
+        small = few.all(axis=0)
         parameters = moved(parameters, step)
         if not n_left or small.all():
             break
@@ -567,8 +578,8 @@ class _Windows(NamedTuple):
         None where windows of such pixels cannot be taken by one index, or do not mean one thing.
         """
         n_rows = slice_.info.shape[0] if slice_.info.shape is not None else len(slice_.stored)
-        around = float(radius.max()) + ROWS_BEYOND
-        first, end = max(int(v.min() - around), 0), min(int(v.max() + around), n_rows)
+        at, around = v.tolist(), max(radius.tolist()) + ROWS_BEYOND
+        first, end = max(int(min(at) - around), 0), min(int(max(at) + around), n_rows)
         rows = slice_.rows(first, max(first, end))
         if not _is_plain(rows):
             return None
@@ -666,8 +677,8 @@ class _Windows(NamedTuple):
     def _inside(self, middles: FloatArray, radius: int) -> BoolArray:
         """Which (k,) windows about ``middles`` (k, 2) lie in the image."""
         rows, columns = self.shape
-        u, v = middles[:, 0], middles[:, 1] - self.first_row
-        return np.asarray((np.minimum(u, v) >= radius) & (u < columns - radius) & (v < rows - radius))
+        right, first, end = columns - radius, self.first_row + radius, self.first_row + rows - radius
+        return np.array([radius <= u < right and first <= v < end for u, v in middles.tolist()])
 
     def _at(self, middles: FloatArray, radius: int) -> FloatArray:
         """Upright values (k, p) on discs about whole pixels (k, 2); beyond the image they mean nothing."""
@@ -691,12 +702,7 @@ def _is_plain(stored: NDArray[Any]) -> bool:
 
 def _near_each_other(centre: FloatArray) -> BoolArray:
     """(k, k) which of the places (k, 2) lie in one another's windows."""
-    u, v = centre.T
-    d_u, d_v = u[:, None] - u, v[:, None] - v
-    d_u *= d_u
-    d_v *= d_v
-    d_u += d_v
-    return np.asarray(d_u <= RADIUS_PX**2)
+    return np.asarray(_length(centre[:, None] - centre) <= RADIUS_PX)
 
 
 def _length(vectors: FloatArray) -> FloatArray:

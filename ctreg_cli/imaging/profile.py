@@ -170,10 +170,10 @@ class Rows:
         return Rows(u, v, self._values[which], clipped, self.root_weights[which], long, self._areas, flat=self.flat)
 
     def evaluate(self, parameters: FloatArray) -> FloatArray:
-        """Fill :attr:`by_spot` for ``parameters`` (10, k); products of its rows (k, 11, 11), summed over the pixels.
+        """Fill :attr:`by_spot` for ``parameters`` (10, k); products of its rows with the derivatives, over the pixels.
 
-        These hold the normal matrix, in the last column the gradient, in the last place the sum of squares. A clipped
-        pixel says only "at least this bright": where the profile is brighter still, it takes no part.
+        These (k, 11, 10) hold the normal matrix, and in the last row the gradient. A clipped pixel says only "at least
+        this bright": where the profile is brighter still, it takes no part.
         """
         rows = self._rows
         if self._has_left_out:
@@ -198,7 +198,8 @@ class Rows:
             satisfied = np.flatnonzero(self._clipped & (residuals <= 0))
             rows.reshape(len(rows), -1)[:, satisfied] = 0.0
             self._has_left_out = len(satisfied) > 0
-        return np.asarray(self.by_spot @ rows.transpose(1, 2, 0))
+        # without the last row on one side: a matrix times its own transpose takes BLAS three times as long at this size
+        return np.asarray(self.by_spot @ rows[:N_PARAMETERS].transpose(1, 2, 0))
 
     def _fill_edge(self, rows: FloatArray, parameters: FloatArray, root_weights: FloatArray | None) -> None:
         """The same of spots of thick rods: flat but for an edge that is blurred."""

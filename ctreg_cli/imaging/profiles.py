@@ -108,7 +108,8 @@ def fit_profiles(blobs: Blobs, ceiling: float) -> Profiles:
     usable = ~np.isnan(values)
     if not usable.all():
         values = np.where(usable, values, blobs.background[:, None])
-    distance = distance_beyond_edge(blobs.moments, u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None])
+    edge = np.array(inverse_elements(4.0 * blobs.moments))
+    distance = distance_beyond_edge(edge, u - blobs.centre[:, 0, None], v - blobs.centre[:, 1, None])
     near = (distance > NEAR_PX[0]) & (distance < NEAR_PX[1]) & usable
     if blobs.foreign.any():
         foreign = dilated(blobs.foreign).reshape(k, -1)[:, at] & usable
@@ -312,20 +313,21 @@ def steepness(parameters: FloatArray, long: BoolArray, ceiling: float) -> tuple[
         return at_edge, at_edge * 2.0 * np.maximum(at_ceiling, 0.0) ** (1.0 - 0.5 / beta)
 
 
-def distance_beyond_edge(moments: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Distance (k, p) of points outside the uniform ellipses with these second moments, px; 0 inside.
+def distance_beyond_edge(edge: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance (k, p) of points outside ellipses, along the lines to their middles, px; 0 inside.
 
     Args:
-        moments: (k, 2, 2) px².
+        edge: (3, k) A, B, C of each, ``A x² + 2 B x y + C y² = 1``: for a uniform ellipse, which has a quarter of its
+            semi-axes squared, the inverse of four times its second moments.
         x: (k, p) from the ellipse's middle, px.
         y: likewise.
     """
-    uu, uv, vv = inverse_elements(4.0 * moments)  # such an ellipse has a quarter of its semi-axes squared
+    uu, uv, vv = edge[:, :, None]
     xx, yy = x * x, y * y
-    q = uu[:, None] * xx
-    q += vv[:, None] * yy
+    q = uu * xx
+    q += vv * yy
     xy = x * y
-    xy *= 2.0 * uv[:, None]
+    xy *= uv + uv
     q += xy
     xx += yy
     distance = np.sqrt(xx)

@@ -120,12 +120,13 @@ class Spots:
         """Spots of all arrays above that are nobody else's, float64 and of their shapes: taken over, neither copied nor
         checked.
         """
-        spots = object.__new__(cls)
+        spots, set_ = object.__new__(cls), object.__setattr__
         for name, values in arrays.items():
             values.flags.writeable = False
-            object.__setattr__(spots, name, values)
-        for name, value in (("sd_assumed", sd_assumed), ("rejected", rejected), ("n_rejected", n_rejected or {})):
-            object.__setattr__(spots, name, value)
+            set_(spots, name, values)
+        set_(spots, "sd_assumed", sd_assumed)
+        set_(spots, "rejected", rejected)
+        set_(spots, "n_rejected", n_rejected or {})
         return spots
 
     def take(self, which: BoolArray | IntArray) -> Spots:

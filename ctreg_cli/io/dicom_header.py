@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache, wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
+from typing import Any, BinaryIO, Concatenate, NamedTuple, ParamSpec, TypeVar
 
 from pydicom.datadict import dictionary_description, tag_for_keyword
 from pydicom.filereader import data_element_generator
@@ -267,8 +267,7 @@ def once_a_series(
 _IS_TEXT = {keyword: keyword in ("InstanceNumber", "NumberOfFrames") for keyword in _TAG}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PixelElement:
+class PixelElement(NamedTuple):
     """Where the pixels of a file begin."""
 
     keyword: str
@@ -279,8 +278,7 @@ class PixelElement:
     offset: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Header:
+class Header(NamedTuple):
     """What stands before the pixels of one file."""
 
     elements: Elements

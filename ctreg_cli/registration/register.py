@@ -107,7 +107,9 @@ def make_scene(
     contrasts = spots.contrast.tolist()
     field = None
     if shape is not None:
-        field = np.array([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]) * s
+        field = np.array(
+            [[-0.5 * scale.s_x, -0.5 * scale.s_y], [(shape[1] - 0.5) * scale.s_x, (shape[0] - 0.5) * scale.s_y]]
+        )
     return Scene(
         xy_mm=spots.uv_px * s,
         covariance_mm=spots.covariance_px * (s[:, None] * s),

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray
-from ctreg_cli.tracking.single import inverse_positive, shifted, updated
+from ctreg_cli.tracking.single import carried, inverse_positive, shifted, updated
 
 Prediction = Literal["velocity", "identity"]
 
@@ -38,8 +38,7 @@ MEMORY, LEAST_LOG_STEP, MOST_LOG_STEP = 0.95, -0.5, 2.5
 _SHARE_OF_VELOCITY = 0.75
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MotionState:
+class MotionState(NamedTuple):
     """What is known of the frame's motion at one time."""
 
     #: (4, 4) model axes, origin in the frame's middle → axes that the table does not move, mm
@@ -103,13 +102,14 @@ def start(
 
 def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     """The motion ``dt_s`` later."""
-    P = state.covariance.copy()
+    F = _EYE12.copy()
+    if kind == "velocity":
+        F.ravel()[_POSE_VELOCITY] = dt_s
+    P = carried(F, state.covariance)
     diagonals = P.ravel()  # a view: every 13th element is the next on the diagonal
     drifted = np.array(state.intensity)
     drifted *= dt_s
     if kind == "velocity":
-        P[:6] += dt_s * P[6:]
-        P[:, :6] += dt_s * P[:, 6:]
         diagonals[_VELOCITY] += drifted
         drifted *= 0.5 * dt_s
         diagonals[_POSE_VELOCITY] += drifted
@@ -119,8 +119,8 @@ def advance(state: MotionState, dt_s: float, kind: Prediction) -> MotionState:
     drifted += _each_axis(_LEAST2[0] + dt_s * _DOUBT2[0], _LEAST2[1] + dt_s * _DOUBT2[1])
     diagonals[_POSE] += drifted
     lasting = state.lasting
-    if lasting is not None and kind == "velocity":
-        lasting = np.concatenate([lasting[:6] + dt_s * lasting[6:], lasting[6:]])
+    if lasting is not None:
+        lasting = F.dot(lasting)
     return MotionState(
         T=updated(state.T, dt_s * state.velocity),
         velocity=state.velocity,
@@ -254,6 +254,7 @@ def _each_axis(place: float, turn: float) -> FloatArray:
     return np.array([place, place, place, turn, turn, turn])
 
 
+_EYE12 = np.eye(12)
 #: places in a (12, 12) covariance, row by row, of the diagonals of its four blocks
 _POSE, _VELOCITY = slice(0, 72, 13), slice(78, None, 13)
 _POSE_VELOCITY, _VELOCITY_POSE = slice(6, 72, 13), slice(72, 138, 13)

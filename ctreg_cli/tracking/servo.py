@@ -55,8 +55,7 @@ class ServoOptions:
     max_iterations: int = 400
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Desired:
+class Desired(NamedTuple):
     """The desired features s*: ``k`` measured spots and the rods they belong to."""
 
     #: (4, 2k) the rods (:func:`~ctreg_cli.tracking.single.lines`), model frame, mm, and (k,) their tolerances
@@ -290,9 +289,10 @@ def servo(
 class _Law(NamedTuple):
     """``ξ = Ĵ⁺ (s* − s)`` with one Ĵ."""
 
-    #: (2k, 6) ``W Ĵ``, and (6, 6) ``Ĵᵀ W Ĵ``
+    #: (2k, 6) ``W Ĵ``, and (6, 6) ``Ĵᵀ W Ĵ`` and its inverse
     weighted: FloatArray
     information: FloatArray
+    inverse: FloatArray
     #: (6, 2k) Ĵ⁺ of the constant strategy; None where Ĵ is the Jacobian at hand
     J_plus: FloatArray | None
 
@@ -304,13 +304,14 @@ class _Law(NamedTuple):
         return cls(
             weighted=WJ,
             information=information,
+            inverse=inverse_positive(information),
             J_plus=None if jacobian is None else solve_positive(information, WJ.T),
         )
 
     def full_step(self, here: View) -> tuple[FloatArray, float]:
         """The twist (6,) of gain one, and how far it would move the spots: Σ ‖Δs‖² in sd, to first order."""
         gradient = here.residual_px.reshape(-1).dot(self.weighted)
-        step = solve_positive(self.information, gradient)
+        step = self.inverse.dot(gradient)
         return step, float(gradient.dot(step))
 
     def margin(self, here: View, size_mm: float) -> float:
@@ -320,7 +321,7 @@ class _Law(NamedTuple):
     def covariance(self, here: View) -> FloatArray:
         """(6, 6) of the pose where the law comes to rest."""
         if self.J_plus is None:
-            return inverse_positive(self.information)
+            return self.inverse
         # noise moves the pose where Ĵᵀ W r = 0 by (Ĵ⁺ J)⁻¹ Ĵ⁺
         influence = np.linalg.solve(self.J_plus @ here.jacobian, self.J_plus)
         spread = (influence.reshape(6, -1, 2).transpose(1, 0, 2) @ here.covariance_px).transpose(1, 0, 2)

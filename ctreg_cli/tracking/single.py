@@ -8,6 +8,7 @@ Tests hold every function here equal to its counterpart.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -229,6 +230,22 @@ def determinant_2x2(matrices: FloatArray) -> FloatArray:
     return determinant
 
 
+def largest_eigenvalue(elements: Sequence[float]) -> float:
+    """Of a symmetric (3, 3) matrix given row by row (Smith 1961), at less than half of what LAPACK costs.
+
+    Where the largest two are the same, to half of the digits.
+    """
+    xx, xy, xz, _, yy, yz, _, _, zz = elements
+    mean = (xx + yy + zz) / 3.0
+    x, y, z = xx - mean, yy - mean, zz - mean
+    spread2 = (x * x + y * y + z * z + 2.0 * (xy * xy + yz * yz + xz * xz)) / 6.0
+    spread = math.sqrt(spread2)
+    half_determinant = 0.5 * (x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz))
+    cube = spread2 * spread
+    cosine = half_determinant / cube if cube > 0 else 1.0
+    return mean + 2.0 * spread * math.cos(math.acos(min(max(cosine, -1.0), 1.0)) / 3.0)
+
+
 def shifted(lever_mm: FloatArray) -> FloatArray:
     """(6, 6) that takes a twist to the one at a point ``lever_mm`` (3,) away: ``V + Ω × lever``."""
     x, y, z = lever_mm.tolist()
@@ -240,7 +257,7 @@ def shifted(lever_mm: FloatArray) -> FloatArray:
 
 
 def carried(G: FloatArray, covariance: FloatArray) -> FloatArray:
-    """``G C Gᵀ``: a covariance (6, 6) of twists that ``G`` (6, 6) takes elsewhere."""
+    """``G C Gᵀ``: a covariance (n, n), of twists say, that ``G`` (n, n) takes elsewhere."""
     result: FloatArray = G.dot(covariance).dot(G.T)
     return result
 

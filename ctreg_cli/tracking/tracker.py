@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -114,8 +115,7 @@ class Tracked:
     begins: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Prediction:
+class Prediction(NamedTuple):
     """Where the frame should be in the next slice."""
 
     #: (4, 4), and the (6, 6) covariance of the twist from it to the truth
@@ -135,8 +135,7 @@ class Prediction:
     n_slices: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Past:
+class _Past(NamedTuple):
     """The last slice with a sure pose."""
 
     motion: motion.MotionState
@@ -281,7 +280,7 @@ class Tracker:
         """A slice that could not be read: time passes."""
         self._is_lost = self._is_lost or self._past is not None
         if self._past is not None:
-            self._past = replace(self._past, n_missed=self._past.n_missed + 1)
+            self._past = self._past._replace(n_missed=self._past.n_missed + 1)
 
     def _axes(self, info: SliceInfo) -> motion.StillAxes:
         return motion.StillAxes(middle=self.model.centre, T_patient_slice=info.T_patient_slice)
@@ -321,7 +320,7 @@ class Tracker:
             if not why:
                 return followed, ""
         anew, _ = self._servoed_with(None, prediction, scene)
-        return (None, why) if anew is None else (replace(anew, renewed=why), "")
+        return (None, why) if anew is None else (anew._replace(renewed=why), "")
 
     def _servoed_with(
         self, kept_jacobian: FloatArray | None, prediction: Prediction, scene: Scene
@@ -703,8 +702,7 @@ class Tracker:
         return Velocity(twist=G @ state.velocity, covariance=carried(G, state.velocity_covariance))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Followed:
+class _Followed(NamedTuple):
     """Where the servo brought the frame, and with which spots."""
 
     #: (n,) spot of each rod, −1 for none

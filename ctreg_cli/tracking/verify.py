@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
 from ctreg_cli.arrays import FloatArray, IntArray
 from ctreg_cli.geometry import pose as poses
@@ -41,6 +41,7 @@ from ctreg_cli.tracking.single import (
     determinant_2x2,
     difference,
     inverse_2x2,
+    largest_eigenvalue,
     levers,
     log_determinant,
     mahalanobis2,
@@ -106,7 +107,7 @@ def verified(
     rods = np.nonzero(spot_of_rod >= 0)[0]
     dof = 2 * len(rods) - 6
     chi2 = moved.chi2
-    if len(rods) < CHECKABLE_MATCHES or float(chdtrc(dof, chi2)) < INFLATE_P or not _allowed(scene, T):
+    if len(rods) < CHECKABLE_MATCHES or chi2 > _most_chi2(dof) or not _allowed(scene, T):
         return None
     if is_vaguer(C, VAGUE_POSE_RAD) or is_vaguer(predicted_covariance, VAGUE_PREDICTION_RAD):
         return None
@@ -114,11 +115,11 @@ def verified(
     missing = _NONE if len(rods) == len(model) else np.nonzero(outlook.must_be_seen() & (spot_of_rod < 0))[0]
     if not all(outlook.may_be_seen()[rods].tolist()) or len(missing) > len(rods):
         return None
-    apart2 = _least_distance2(crossings.xy_mm, rods, missing)
-    if apart2 < _reach_mm(model) ** 2 or outlook.has_ends_near(rods):
+    apart_mm = _least_distance_mm(crossings.xy_mm, rods, missing)
+    if apart_mm < _reach_mm(model) or outlook.has_ends_near(rods):
         return None
     without = LeftOut.of(moved)
-    if without is None or _contested(scene, moved, without, spot_of_rod[rods], apart2):
+    if without is None or _contested(scene, moved, without, spot_of_rod[rods], apart_mm):
         return None
     protection = without.protection_mm(_protected(model), moved, options.integrity_risk)
     if options.alert_limit_mm is not None and protection.max() > options.alert_limit_mm:
@@ -226,6 +227,12 @@ def is_vaguer(covariance: FloatArray, limit_rad: float) -> bool:
     return float(np.linalg.eigvalsh(turn)[-1]) > limit_rad**2
 
 
+@lru_cache(maxsize=64)
+def _most_chi2(degrees_of_freedom: int) -> float:
+    """Of residuals that need no inflation."""
+    return float(chdtri(degrees_of_freedom, INFLATE_P))
+
+
 @lru_cache(maxsize=16)
 def _reach_mm(model: RodModel) -> float:
     """Crossings closer than this may leave one spot; cached, since a model is a value that never changes."""
@@ -239,19 +246,15 @@ def _protected(model: RodModel) -> FloatArray:
     return protected_points(model)
 
 
-def _least_distance2(xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> float:
-    """Of a rod that is seen, or should be, from the crossing of a seen one, mm²: where it is small, their spots may be
-    one.
-    """
-    x, y = xy_mm.take(rods, axis=0).T
-    there_x, there_y = (x, y) if not len(missing) else xy_mm.take(np.concatenate([rods, missing]), axis=0).T
-    d_x, d_y = there_x[:, None] - x, there_y[:, None] - y
-    d_x *= d_x
-    d_y *= d_y
-    d_x += d_y
+def _least_distance_mm(xy_mm: FloatArray, rods: IntArray, missing: IntArray) -> float:
+    """Of a rod that is seen, or should be, from a seen one: where it is small, their spots may be one."""
+    places = xy_mm[:, 0] + 1j * xy_mm[:, 1]
+    here = places.take(rods)
+    there = here if not len(missing) else places.take(np.concatenate([rods, missing]))
+    apart = np.abs(there[:, None] - here)
     k = len(rods)
-    d_x.ravel()[: k * k : k + 1] = np.inf  # each lies on itself
-    return float(d_x.min())
+    apart.ravel()[: k * k : k + 1] = np.inf  # each lies on itself
+    return float(apart.min())
 
 
 class LeftOut(NamedTuple):
@@ -302,7 +305,7 @@ class LeftOut(NamedTuple):
         variance = np.empty((p, k + 1, 3, 3))
         variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
         variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
-        level = np.sqrt(np.linalg.eigvalsh(variance)[..., -1])
+        level = np.sqrt(np.array([*map(largest_eigenvalue, variance.reshape(-1, 9).tolist())])).reshape(p, k + 1)
         level *= _sd_at_risk(risk, k)
         separation = (moves @ self.pull[:, :, None])[..., 0]
         level[:, :k] += np.sqrt((separation * separation).sum(axis=-1))
@@ -315,10 +318,10 @@ def _sd_at_risk(risk: float, n_matches: int) -> float:
     return math.sqrt(float(chdtri(3, risk / (n_matches + 1))))
 
 
-def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray, apart2: float) -> bool:
+def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArray, apart_mm: float) -> bool:
     """Whether a spot is not where the others predict it, or another could be there as well, by fit or by chance.
 
-    ``apart2``: least squared distance of two of the rods' crossings, mm².
+    ``apart_mm``: least distance of two of the rods' crossings.
     """
     if max(without.distance2.tolist()) > ODD_D2:
         return True
@@ -333,7 +336,7 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
         # the rods' own spots: far from each other by more than the widest gate, and what two may lie off
         widest = CONTEST_D2 * max((without.gate[:, 0, 0] + without.gate[:, 1, 1]).tolist())
         off = max(map(abs, moved.view.residual_px.ravel().tolist())) * math.sqrt(2.0)
-        if apart2 > (2.0 * math.sqrt(widest) + off) ** 2:
+        if apart_mm > 2.0 * math.sqrt(widest) + off:
             return False
     predicted = scene.xy_mm[spots] - (moved.view.covariance_px @ without.pull[:, :, None])[:, :, 0]
     d_x, d_y = scene.xy_mm.T[:, None] - predicted.T[:, :, None]  # each (k, m)
@@ -345,8 +348,11 @@ def _contested(scene: Scene, moved: ServoResult, without: LeftOut, spots: IntArr
 def _hides_a_misfit(model: RodModel, moved: ServoResult) -> bool:
     """Whether the spots speak of a scale or a frame's height that is off: the score test of registration.
 
-    See :mod:`~ctreg_cli.registration.misfit`; in closed form, the spots in millimetres.
+    See :mod:`~ctreg_cli.registration.misfit`; in closed form, the spots in millimetres. The score is what χ² would fall
+    by were these free, so that most slices need not work it out.
     """
+    if moved.chi2 <= MISFIT_SCORE:
+        return False
     seen = moved.view
     k = len(seen.residual_px)
     K = hidden_derivatives(model, moved.T, seen.crossing.xy_mm, seen.crossing.slope)

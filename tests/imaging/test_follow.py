@@ -10,6 +10,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from ctreg_cli.imaging import follow
+from ctreg_cli.imaging.blob import axes_of, ellipse, inverse_elements, moments_of, monomials
 from ctreg_cli.imaging.follow import LAW_EVERY, MAX_AGE, Follower
 from ctreg_cli.imaging.segmentation import DEFAULT_OPTIONS, SegmentationOptions, measure_spots
 from ctreg_cli.imaging.slice import Slice
@@ -64,6 +65,17 @@ def in_own_variances(spots: Spots, uv: np.ndarray) -> float:
     """Mean squared error a coordinate of the spots nearest to true places."""
     error = spots.uv_px - uv
     return float(np.einsum("ki,kij,kj->k", error, np.linalg.inv(spots.covariance_px), error).mean() / 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_ellipse_is_that_of_many(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    terms, shares = monomials(5), np.array([0.0, 0.01, 0.3, 0.9, 1.0])
+    own = rng.random((5, len(terms))) < shares[:, None]
+    _, middle, moments = moments_of(own, terms)
+    expected = np.array([*middle.T, *inverse_elements(4.0 * moments), *axes_of(moments)])
+    one_by_one = np.transpose([ellipse(*sums) for sums in (own.astype(float) @ terms).tolist()])
+    np.testing.assert_allclose(one_by_one, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -86,6 +86,25 @@ def test_small_positive_definite_systems() -> None:
     np.testing.assert_array_equal(single.inverse_2x2(blocks, determinants), single.inverse_2x2(blocks))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_largest_eigenvalues(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-4, 4, size=3)
+    turn = Rotation.random(random_state=rng).as_matrix()
+    twice = turn @ np.diag([2.0, 2.0, 1.0]) @ turn.T
+    line = np.outer(half[0], half[0])
+    for A, accuracy in (
+        (half @ half.T, 1e-12),
+        (3.0 * np.eye(3) - twice, 1e-12),
+        (line, 1e-12),
+        (np.eye(3), 1e-12),
+        (np.zeros((3, 3)), 1e-12),
+        (twice, 1e-7),  # half of the digits, where the largest two are the same
+        (1e-120 * twice, 1e-7),
+    ):
+        assert single.largest_eigenvalue(A.ravel().tolist()) == pytest.approx(np.linalg.eigvalsh(A)[-1], rel=accuracy)
+
+
 def test_how_a_twist_moves_points() -> None:
     rng = np.random.default_rng(2)
     points, twist = rng.normal(size=(4, 3)), rng.normal(size=6)
