@@ -107,6 +107,10 @@ class PastPrior:
             seen = observations(scene, matches.spot_of_rod)
             nearby = most_probable(model, seen, self.T, self.covariance)
             leads, _ = _leads_there(matches, nearby)
+        if not leads.all():
+            # past and spots may leave several poses to the same matches: another minimum is asked for its own
+            start = np.where(leads[:, None, None], self.T, matches.T)
+            nearby = most_probable(model, seen, self.T, self.covariance, start=start)
         H, _ = matches.fit.normal_equations()
         C, _ = covariance_from_information(H, model.size_mm)
         density = np.array([self.log_density(T, c) for T, c in zip(matches.T, C, strict=True)])
@@ -228,12 +232,17 @@ class MostProbable:
     covariance: FloatArray
     #: the spots there
     fit: Linearisation
-    #: (b,) whether there is such a pose near where the past expects the frame
+    #: (b,) whether there is such a pose near where it was looked for
     found: BoolArray
 
 
 def most_probable(
-    model: RodModel, seen: Observations, T_predicted: FloatArray, predicted_covariance: FloatArray
+    model: RodModel,
+    seen: Observations,
+    T_predicted: FloatArray,
+    predicted_covariance: FloatArray,
+    *,
+    start: FloatArray | None = None,
 ) -> MostProbable:
     """The poses most probable with the past taken in, by Gauss–Newton from where it expects the frame.
 
@@ -242,10 +251,11 @@ def most_probable(
         seen: ``b`` hypotheses.
         T_predicted: (4, 4) where the past expects the frame.
         predicted_covariance: (6, 6) of it.
+        start: (b, 4, 4) where to look for them instead.
     """
     b = len(seen.matched)
     P_inverse = np.linalg.inv(predicted_covariance)
-    T = np.repeat(T_predicted[None], b, axis=0)
+    T = np.repeat(T_predicted[None], b, axis=0) if start is None else start
     fit = linearise(model, T, seen)
     size2 = np.full(b, np.inf)
     C = np.empty((b, 6, 6))

@@ -35,6 +35,7 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.gate import Outlook
+from ctreg_cli.tracking.other_minimum import TWO_MINIMA_CONDITION, has_other_minimum
 from ctreg_cli.tracking.posterior import most_probable_pose
 from ctreg_cli.tracking.servo import Desired, ServoResult
 from ctreg_cli.tracking.single import (
@@ -152,7 +153,12 @@ def verified(
     )
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return None
-    clear = not spots.sd_assumed and _is_strong(model, moved)
+    weakness = _greatest_condition(model, moved)
+    if weakness > TWO_MINIMA_CONDITION:
+        desired = Desired.of(model, rods, scene.xy_mm[best.spot_index], scene.covariance_mm[best.spot_index])
+        if has_other_minimum(model, moved, desired, T_predicted, predicted_covariance):
+            return None
+    clear = not spots.sd_assumed and weakness < WEAK_CONDITION
     return Registration(
         status="ok",
         reason="",
@@ -168,8 +174,8 @@ def _kept(values: _Array) -> _Array:
     return values
 
 
-def _is_strong(model: RodModel, moved: ServoResult) -> bool:
-    """Whether no direction of the pose is known so much worse than another that :func:`fit_warnings` would name it.
+def _greatest_condition(model: RodModel, moved: ServoResult) -> float:
+    """How many times worse one direction of the pose may be known than another, at most.
 
     The largest eigenvalue of a covariance is at most its trace, the inverse of the smallest at most that of the
     information.
@@ -177,7 +183,7 @@ def _is_strong(model: RodModel, moved: ServoResult) -> bool:
     variances, informations = moved.covariance.diagonal().tolist(), moved.information.diagonal().tolist()
     size2 = model.size_mm**2
     spread = sum(variances[:3]) + size2 * sum(variances[3:])
-    return bool(spread * (sum(informations[:3]) + sum(informations[3:]) / size2) < WEAK_CONDITION**2)
+    return math.sqrt(spread * (sum(informations[:3]) + sum(informations[3:]) / size2))
 
 
 def agrees_with_past(
