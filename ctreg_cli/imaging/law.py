@@ -15,12 +15,15 @@ from ctreg_cli.arrays import BoolArray, FloatArray, IntArray
 from ctreg_cli.imaging.profile import N_PARAMETERS, SHAPE, in_pixels
 from ctreg_cli.imaging.profiles import RIM_PX, Profiles, steepness
 from ctreg_cli.imaging.uncertainty import (
+    HIDING_SHARE,
     KEPT,
+    KEPT_ABOVE_FLOOR,
     centre_covariance,
     even_variance,
     noise_at_floor,
     noise_field,
     odd_variance,
+    odd_variance_above_floor,
     responses,
 )
 
@@ -38,6 +41,8 @@ MISFIT_SHARE = 1.2
 #: a faint spot's size and height come from the same noise as its centre, which makes it look surer than it is: its
 #: variance is twice that of the linear law where it stands out by so many sd of the noise
 FAINT_SD = 5.0
+#: roots of weights below this share of the greatest are of pixels that were left out of the fit
+LEAST_SHARE_OF_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,7 +157,17 @@ def centre_law(fitted: Profiles, shift: FloatArray, radius: int) -> Law:
 
 def structure_near(fitted: Profiles, rough: FloatArray, radius: int) -> FloatArray:
     """Variance (k,) of the background structure that disturbs fitted centres, beyond noise of sd ``rough`` (k,)."""
-    return odd_variance(fitted.residuals, fitted.near, fitted.centre, radius, rough) / KEPT
+    variance = odd_variance(fitted.residuals, fitted.near, fitted.centre, radius, rough) / KEPT
+    values, near, quiet = fitted.rows.values, fitted.near, fitted.quiet
+    at_floor = values <= np.where(quiet, values, np.inf).min(axis=1, keepdims=True)
+    hides = np.count_nonzero(at_floor & near, axis=1) > HIDING_SHARE * np.count_nonzero(near, axis=1)
+    if hides.any():
+        root_weights = fitted.rows.root_weights
+        in_fit = root_weights > LEAST_SHARE_OF_WEIGHT * root_weights.max(axis=1, keepdims=True)
+        shown = (near | ~quiet) & ~at_floor & (values < fitted.ceiling) & in_fit
+        above = odd_variance_above_floor(fitted.residuals, shown, fitted.centre, radius, rough) / KEPT_ABOVE_FLOOR
+        variance = np.where(hides, np.maximum(variance, above), variance)
+    return variance
 
 
 def _of_pixels(fitted: Profiles) -> FloatArray:

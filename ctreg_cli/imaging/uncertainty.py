@@ -19,8 +19,13 @@ from ctreg_cli.imaging.window import disc, grid, nan_quantile, ring
 STRUCTURE_LENGTH_PX = 2.0
 #: share of the odd part of such structure about a spot that its fit leaves in the residuals (0.5 … 0.75 were computed)
 KEPT = 0.65
+#: where surroundings are cut off below, the spot's own pixels are looked at too, of which the fit leaves less; and how
+#: many of the pairs it takes
+KEPT_ABOVE_FLOOR, FITTED_ODD = 0.3, 2.0
+#: surroundings of which more than this share hold the least value may hide structure
+HIDING_SHARE = 0.05
 #: in standard errors, what noise about a spot may look like by chance
-SURE_OF_STRUCTURE = 3.0
+SURE_OF_STRUCTURE, NEARLY_SURE_OF_STRUCTURE = 3.0, 2.0
 #: sd of a normal distribution over its median absolute deviation
 MAD_TO_SD = 1.4826
 #: standard error of a ratio of two variances by medians, over that of one by the mean of squares
@@ -175,21 +180,43 @@ def odd_variance(
     beyond. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; only odd
     ones do.
     """
+    squares, pairs = _odd_squares(residuals, near, centre, radius)
+    pairs = np.maximum(pairs, 1.0)
+    excess = squares / pairs / noise**2 - 1.0
+    chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
+    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
+
+
+def odd_variance_above_floor(
+    residuals: FloatArray, shown: BoolArray, centre: FloatArray, radius: int, noise: FloatArray
+) -> FloatArray:
+    """The same where surroundings are cut off below, by what is ``shown`` (k, p) of them and of the spot itself.
+
+    Of a dark streak in air nothing is seen but where it crosses the spot. There the fit takes two of the few pairs, and
+    chance is not easily told from structure: less is asked of it.
+    """
+    squares, pairs = _odd_squares(residuals, shown, centre, radius)
+    free = np.maximum(pairs - FITTED_ODD, 1.0)
+    excess = squares / free / noise**2 - 1.0
+    chance = NEARLY_SURE_OF_STRUCTURE * np.sqrt(2.0 / free)
+    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
+
+
+def _odd_squares(
+    residuals: FloatArray, where: BoolArray, centre: FloatArray, radius: int
+) -> tuple[FloatArray, FloatArray]:
+    """Sum of squares (k,) of the part of residuals that is odd about ``centre`` (2, k); and of how many pairs."""
     k, p = residuals.shape
     known = np.empty((k, p + 1))
     known.fill(np.nan)
-    np.copyto(known[:, :p], residuals, where=near)
+    np.copyto(known[:, :p], residuals, where=where)
     twice = np.rint(np.fmax(np.fmin(2.0 * centre, _MARGIN), -_MARGIN)) + _MARGIN
     opposite = _opposite(radius).take((twice[1] * (2 * _MARGIN + 1) + twice[0]).astype(np.intp), axis=0)
     opposite += (p + 1) * np.arange(k)[:, None]
     odd = known[:, :p] - known.take(opposite)
     paired = odd == odd  # neither is NaN
-    pairs = np.maximum(0.5 * paired.sum(axis=1), 1.0)
     odd *= odd
-    variance = 0.25 * np.fmax(odd, 0.0).sum(axis=1) / pairs  # fmax passes NaN over
-    excess = variance / noise**2 - 1.0
-    chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
-    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
+    return 0.25 * np.fmax(odd, 0.0).sum(axis=1), 0.5 * paired.sum(axis=1)  # fmax passes NaN over
 
 
 def even_variance(residuals: FloatArray, quiet: BoolArray, *, smooth: FloatArray, rough: FloatArray) -> FloatArray:

@@ -218,6 +218,27 @@ def test_a_streak_through_a_spot_widens_it() -> None:
     assert np.sqrt(np.mean(np.square(scaled))) < 2.0
 
 
+@pytest.mark.parametrize("depth", [30.0, 100.0, 200.0])
+@pytest.mark.parametrize("ceiling", [np.inf, 4095.0])
+def test_dark_streaks_that_air_at_the_floor_hides_are_owned_up_to(depth: float, ceiling: float) -> None:
+    """From every rod three go out into air that stands 24 above the image's least value: there they are cut off."""
+    rng = np.random.default_rng(6)
+    image, uv = render_grid(rng, SIDE, PITCH, contrast=6000.0)
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    for centre in uv:
+        for angle in rng.uniform(0, 2 * np.pi, 3):
+            x, y = u - centre[0], v - centre[1]
+            along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+            shape = np.exp(-0.5 * (across / 1.5) ** 2 - np.maximum(along, -3.0 * along) / 12.0)
+            image -= depth * shape * (np.hypot(x, y) < PITCH / 2)
+    own = []
+    for _ in range(3):
+        noisy = np.clip(image + 24.0 + rng.normal(0.0, 15.0, image.shape), 0.0, ceiling)
+        error, covariance = errors(find_spots(as_slice(noisy)), uv)
+        own.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error) / 2)
+    assert np.concatenate(own).mean() < 1.5
+
+
 @pytest.mark.parametrize("blur_px", [0.5, 1.0])
 def test_a_smooth_kernel_s_noise_is_not_taken_for_white(blur_px: float) -> None:
     """Neighbours' noise goes together; the centre then scatters more than white noise of the same sd would make it."""
@@ -248,7 +269,10 @@ def test_tissue_s_texture_about_a_dark_spot_is_owned_up_to(length_px: float) -> 
 
 @pytest.mark.parametrize("case", ["air at the floor", "air beneath it", "soft kernel", "a PNG's black"])
 def test_where_the_surroundings_are_cut_off_below_noise_is_not_taken_for_none(case: str) -> None:
-    """Air at the least value that the image can hold shows no noise: the spot has it all the same."""
+    """Air at the least value that the image can hold shows no noise: the spot has it all the same.
+
+    White noise is taken to be worse than it is, since nothing tells that neighbours share none of it.
+    """
     rng, chi2 = np.random.default_rng([47, len(case)]), []
     for _ in range(2):
         image, uv = render_grid(rng, 6, 30, contrast=2500.0, mm_per_px=1.0 if case == "a PNG's black" else 0.5)
@@ -263,4 +287,4 @@ def test_where_the_surroundings_are_cut_off_below_noise_is_not_taken_for_none(ca
         error = found.uv_px[nearest] - uv
         assert np.abs(error).max() < 1.0
         chi2.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance_px[nearest]), error) / 2)
-    assert 0.3 < np.mean(chi2) < 2.0
+    assert (0.15 if case == "air beneath it" else 0.25) < np.mean(chi2) < 2.0
