@@ -11,6 +11,8 @@ import itertools
 
 import numpy as np
 
+from ctreg_cli.arrays import FloatArray
+from ctreg_cli.geometry import pose as poses
 from ctreg_cli.registration.elsewhere import solutions_without_a_spot
 from ctreg_cli.registration.matching import (
     WIDEST_GATE,
@@ -24,7 +26,7 @@ from ctreg_cli.registration.matching import (
     roots_of_triples,
     weigh,
 )
-from ctreg_cli.registration.refine import linearise, refine
+from ctreg_cli.registration.refine import Linearisation, linearise, refine
 from ctreg_cli.rods import RodModel
 
 #: matches within this many nats of the best are taken apart
@@ -42,6 +44,9 @@ _HOPELESS_CHI2 = 1e3
 _RESTARTS = 20
 #: ... and half of them do for so many matches
 _MANY_MATCHES = 8
+#: a match of so few spots is refined anew from places along its weakest direction as well, so far off, in frame sizes
+#: (or rad)
+_FEW_MATCHES, _AWAY = 6, np.array([-0.35, -0.17, -0.08, -0.035, 0.035, 0.08, 0.17, 0.35])
 #: starts that are refined, and minima that are weighed
 _MOST_STARTS, _MOST_MINIMA = 48, 8
 
@@ -97,6 +102,9 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     if len(triples) > most:  # many matches: twins are rare, and each of them shows in most triples
         triples = triples[:: len(triples) // most + 1]
     T = roots_of_triples(model, scene, spot_of_rod, triples)
+    if len(matched) <= _FEW_MATCHES:  # noise can take a root from each of the few triples
+        along = _along_the_weakest(model, matches.T[row], matches.fit.subset(np.array([row])))
+        T = np.concatenate([T, along[scene.prior.allows(along[:, :3, :3])]])
     if len(T) == 0:
         return None
     same = np.broadcast_to(spot_of_rod, (len(T), len(spot_of_rod)))
@@ -113,6 +121,13 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
     other = (again != same).any(axis=1)
     T, spot_of_rod = np.concatenate([T[hopeful], T[other]]), np.concatenate([same[hopeful], again[other]])
     return weigh(model, scene, T, spot_of_rod, least_matches)
+
+
+def _along_the_weakest(model: RodModel, T: FloatArray, fit: Linearisation) -> FloatArray:
+    """(s, 4, 4) poses away from ``T`` (4, 4) to both sides, along the direction that its spots say least about."""
+    unit = np.array([1, 1, 1, *(3 * [1 / model.size_mm])])
+    _, vectors = np.linalg.eigh(fit.normal_equations()[0][0] * (unit[:, None] * unit))
+    return poses.update(np.repeat(T[None], len(_AWAY), axis=0), _AWAY[:, None] * model.size_mm * unit * vectors[:, 0])
 
 
 def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:

@@ -82,8 +82,8 @@ def protection_levels(
     place = arms + T_all[:, None, :3, 3]
     separation = np.linalg.norm(place - place[0], axis=-1)
     longer = length_of_the_valley(model, T_all, C, seen_all, points, quantile * inflation, prior=prior)
-    noise = quantile * inflation * longer * _largest_sd(C, arms)
-    level = np.concatenate([separation + noise, quantile * _largest_sd(covariance[None], arms[:1])]).max(axis=0)
+    noise = quantile * inflation * longer * largest_sd(C[:, None], arms)
+    level = np.concatenate([separation + noise, quantile * largest_sd(covariance, arms[:1])]).max(axis=0)
     result: FloatArray = np.where(level < _UNKNOWN * model.size_mm, level, np.inf)
     return result
 
@@ -105,9 +105,12 @@ def _one_of_each(
     return T[kept], together.subset(kept)
 
 
-def _largest_sd(C: FloatArray, arms: FloatArray) -> FloatArray:
-    """(b, p) largest sd, in any direction, of points at ``arms`` (b, p, 3) from the model origin, mm."""
+def largest_sd(C: FloatArray, arms: FloatArray) -> FloatArray:
+    """Largest sd (...), in any direction, of points at ``arms`` (..., 3) from the model origin, mm.
+
+    ``C``: (..., 6, 6) covariances of the poses.
+    """
     G = np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape[:-1], 3, 3)), -skew(arms)], axis=-1)
-    values = np.linalg.eigvalsh(G @ C[:, None] @ np.swapaxes(G, -1, -2))
+    values = np.linalg.eigvalsh(G @ C @ np.swapaxes(G, -1, -2))
     result: FloatArray = np.sqrt(np.maximum(values[..., -1], 0))
     return result

@@ -15,9 +15,9 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.doubt import doubt
 from ctreg_cli.registration.elsewhere import solutions_without_a_spot
-from ctreg_cli.registration.evidence import PosePrior
+from ctreg_cli.registration.evidence import P_SEEN, PosePrior
 from ctreg_cli.registration.integrity import LEAST_MATCHES as LEAST_PROTECTED
-from ctreg_cli.registration.integrity import protection_levels, risk_of_each
+from ctreg_cli.registration.integrity import largest_sd, protection_levels, risk_of_each
 from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley, covariance_along_the_valley, positive_part
 from ctreg_cli.registration.matching import Matches, Scene, is_second_frame, observations, search
 from ctreg_cli.registration.misfit import covariance_with_misfit
@@ -61,9 +61,9 @@ INFLATE_P = 1e-2
 WEAK_CONDITION = 60.0
 #: probability of a false match beyond which it is mentioned
 _WORTH_SAYING = 1e-3
-#: a rotation known no better than this (rad), or a place no better than this many frame sizes, is not known at all: the
-#: spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
-_UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 1.0
+#: a rotation known no better than this (rad), or a place of the frame's centre no better than this many frame sizes, is
+#: not known at all: the spots (parallel or coplanar rods) do not determine the pose, and no linear sd describes it
+_UNKNOWN_ROTATION, _UNKNOWN_PLACE = 0.6, 0.25
 #: ln odds that a frame is not its drawing, or the spots are worse than they say
 _LOG_PRIOR_LOOSE = math.log(0.1)
 #: ln odds that a frame is not on its mount
@@ -290,7 +290,7 @@ def decide(
         return refused("bad_fit")
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return refused("bad_fit")
-    if undetermined(model, best.covariance):
+    if undetermined(model, best.T_slice_model, best.covariance):
         return refused("singular_geometry")
     if not frame_is_known and _fits_better_loosely(model, scene, best):
         return refused("bad_fit")
@@ -327,6 +327,8 @@ def decide(
         warnings.append(
             ("averaged", f"a match may be false (probability {share:.2g}); sd widened to cover the pose without it")
         )
+    if undetermined(model, best.T_slice_model, best.covariance):  # as it is widened by now
+        return refused("singular_geometry")
     best = protected(model, scene, best, options, matches)
     if options.alert_limit_mm is not None and not rivals and best.protection_mm.max() > options.alert_limit_mm:
         return refused("unprotected")
@@ -381,7 +383,20 @@ def doubts_and_rivals(
     weight = sum(math.exp(c.log_odds - best.log_odds) for c in rivals)
     second = any(is_second_frame(best.spot_index, c.spot_index, c.log_odds) for c in rivals)
     turned = any(_is_twin_but_for_a_spot(best, c, symmetric) for c in rivals)
-    return doubts, rivals if second or turned or weight > math.exp(-RIVAL_LOG_ODDS) else []
+    hidden = any(_misses_more_rods_only(best, c) for c in rivals)
+    return doubts, rivals if second or turned or hidden or weight > math.exp(-RIVAL_LOG_ODDS) else []
+
+
+def _misses_more_rods_only(best: Candidate, c: Candidate) -> bool:
+    """Whether of the four or five spots that ``best`` rests on ``c`` makes as much, and only misses more rods.
+
+    Rods are hidden together (behind an edge of the image, in a streak), not one by one as the odds have it; and of so
+    few spots a pose has little left to be checked by.
+    """
+    if len(best.rod_index) > LEAST_PROTECTED or len(np.setdiff1d(best.spot_index, c.spot_index)) > 0:
+        return False
+    more = len(c.missing_rods) - len(best.missing_rods)
+    return c.log_odds - more * math.log(1 - P_SEEN) > best.log_odds - RIVAL_LOG_ODDS
 
 
 def _is_twin_but_for_a_spot(best: Candidate, c: Candidate, symmetric: tuple[Twin, ...]) -> bool:
@@ -481,12 +496,11 @@ def _fits_better_turned(model: RodModel, scene: Scene, best: Candidate) -> bool:
     return log_odds_of_other_scale(model, scene, best.T_slice_model, spot_of_rod, loose) > -RIVAL_LOG_ODDS
 
 
-def undetermined(model: RodModel, covariance: FloatArray) -> bool:
-    """Whether some direction of the pose is not known at all, at the frame's centre or in its rotation."""
+def undetermined(model: RodModel, T: FloatArray, covariance: FloatArray) -> bool:
+    """Whether some direction of the pose is not known at all, in the place of the frame's centre or in its rotation."""
     rotation = math.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
-    place = math.sqrt(max(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]), 0.0))
-    reach = model.size_mm + float(np.linalg.norm(model.centre))
-    return rotation > _UNKNOWN_ROTATION or place > _UNKNOWN_PLACE * reach
+    arm = T[:3, :3] @ model.centre
+    return rotation > _UNKNOWN_ROTATION or float(largest_sd(covariance, arm)) > _UNKNOWN_PLACE * model.size_mm
 
 
 def fit_warnings(model: RodModel, spots: Spots, best: Candidate) -> tuple[tuple[str, str], ...]:

@@ -38,6 +38,7 @@ from ctreg_cli.registration.register import (
     make_scene,
     protected,
     refined_candidates,
+    undetermined,
 )
 from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.registration.twins import twins, with_twins
@@ -493,7 +494,10 @@ class Tracker:
 
     def _protected(self, verdict: Registration, scene: Scene) -> Registration:
         """A verdict ``ok`` whose covariance was widened, with the protection levels of that; or why it is none."""
-        best = protected(self.model, scene, verdict.candidates[0], self.options.registration)
+        best = verdict.candidates[0]
+        if undetermined(self.model, best.T_slice_model, best.covariance):
+            return Registration(status="no_pose", reason="singular_geometry", n_spots=verdict.n_spots)
+        best = protected(self.model, scene, best, self.options.registration)
         limit_mm = self.options.registration.alert_limit_mm
         if limit_mm is not None and best.protection_mm.max() > limit_mm:
             return Registration(status="no_pose", reason="unprotected", n_spots=verdict.n_spots)

@@ -157,7 +157,7 @@ def test_few_rods_for_long_are_never_surely_wrong() -> None:
                 d2 = float(error @ np.linalg.solve(best.covariance, error))
                 assert d2 < WRONG_D2, (seed, result.index, d2)
         n_ok += sum(result.status == "ok" for result in results)
-    assert n_ok > 80, n_ok  # of 210: the cuts are bad ones
+    assert n_ok > 70, n_ok  # of 210: the cuts are bad ones, and a pose known to a quarter of the frame's size is none
 
 
 def half_turned(point: list[float]) -> np.ndarray:
