@@ -180,11 +180,7 @@ def odd_variance(
     beyond. A wrong shape of the profile leaves residuals that are even about the centre and do not move it; only odd
     ones do.
     """
-    squares, pairs = _odd_squares(residuals, near, centre, radius)
-    pairs = np.maximum(pairs, 1.0)
-    excess = squares / pairs / noise**2 - 1.0
-    chance = SURE_OF_STRUCTURE * np.sqrt(2.0 / pairs)
-    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
+    return _beyond_noise(*_odd_squares(residuals, near, centre, radius), noise, SURE_OF_STRUCTURE)
 
 
 def odd_variance_above_floor(
@@ -196,10 +192,7 @@ def odd_variance_above_floor(
     chance is not easily told from structure: less is asked of it.
     """
     squares, pairs = _odd_squares(residuals, shown, centre, radius)
-    free = np.maximum(pairs - FITTED_ODD, 1.0)
-    excess = squares / free / noise**2 - 1.0
-    chance = NEARLY_SURE_OF_STRUCTURE * np.sqrt(2.0 / free)
-    return np.asarray(noise**2 * excess * _beyond_chance(excess, chance))
+    return _beyond_noise(squares, pairs - FITTED_ODD, noise, NEARLY_SURE_OF_STRUCTURE)
 
 
 def _odd_squares(
@@ -217,6 +210,13 @@ def _odd_squares(
     paired = odd == odd  # neither is NaN
     odd *= odd
     return 0.25 * np.fmax(odd, 0.0).sum(axis=1), 0.5 * paired.sum(axis=1)  # fmax passes NaN over
+
+
+def _beyond_noise(squares: FloatArray, count: FloatArray, noise: FloatArray, sure: float) -> FloatArray:
+    """Variance (k,) beyond noise of sums of ``count`` squares; ``sure``: standard errors that are taken for chance."""
+    count = np.maximum(count, 1.0)
+    excess = squares / count / noise**2 - 1.0
+    return np.asarray(noise**2 * excess * _beyond_chance(excess, sure * np.sqrt(2.0 / count)))
 
 
 def even_variance(residuals: FloatArray, quiet: BoolArray, *, smooth: FloatArray, rough: FloatArray) -> FloatArray:
