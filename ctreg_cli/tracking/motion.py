@@ -226,12 +226,19 @@ class StillAxes:
     def twist(self, T_slice_model: FloatArray) -> FloatArray:
         """(6, 6) that takes a twist at the model origin in slice axes to the one there."""
         G = shifted(T_slice_model[:3, :3].dot(self.middle))
-        return G if self.T_patient_slice is None else _turned(self.T_patient_slice[:3, :3]).dot(G)
+        if self.T_patient_slice is not None:
+            G[:3] = self.T_patient_slice[:3, :3].dot(G[:3])
+            G[3:, 3:] = self.T_patient_slice[:3, :3]
+        return G
 
     def slice_twist(self, T_slice_model: FloatArray) -> FloatArray:
         """The inverse of :meth:`twist`."""
         G = shifted(-T_slice_model[:3, :3].dot(self.middle))
-        return G if self.T_patient_slice is None else G.dot(_turned(self.T_patient_slice[:3, :3].T))
+        if self.T_patient_slice is not None:
+            turn = self.T_patient_slice[:3, :3].T
+            G[:3, 3:] = G[:3, 3:].dot(turn)
+            G[:3, :3] = G[3:, 3:] = turn
+        return G
 
 
 def inverse_twist(G: FloatArray) -> FloatArray:
@@ -240,12 +247,6 @@ def inverse_twist(G: FloatArray) -> FloatArray:
     R_inverse = G[3:, 3:].T
     B[:3, :3] = B[3:, 3:] = R_inverse
     B[:3, 3:] = -R_inverse.dot(G[:3, 3:]).dot(R_inverse)
-    return B
-
-
-def _turned(R: FloatArray) -> FloatArray:
-    B = np.zeros((6, 6))
-    B[:3, :3] = B[3:, 3:] = R
     return B
 
 

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from operator import add
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import chdtri
 
-from ctreg_cli.arrays import FloatArray, IntArray
+from ctreg_cli.arrays import FloatArray, IntArray, frozen
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.registration.evidence import P_SEEN
@@ -35,7 +36,7 @@ from ctreg_cli.registration.result import Candidate, Registration
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
 from ctreg_cli.tracking.gate import Outlook
-from ctreg_cli.tracking.other_minimum import TWO_MINIMA_CONDITION, has_other_minimum
+from ctreg_cli.tracking.other_minimum import TWO_MINIMA_BOUND, has_other_minimum
 from ctreg_cli.tracking.posterior import most_probable_pose
 from ctreg_cli.tracking.servo import Desired, ServoResult
 from ctreg_cli.tracking.single import (
@@ -77,7 +78,7 @@ _SCALES_PRIOR = np.eye(3) / RELATIVE_SD**2
 _FIXES_ALONE = 1e-9
 #: radius of the frame's neighbourhood, in units of the farthest crossing from their middle; the least, in frame sizes
 _NEIGHBOURHOOD, _LEAST_REACH = 1.25, 1e-3
-_NONE = np.empty(0, dtype=np.intp)
+_NONE, _NOWHERE = np.empty(0, dtype=np.intp), frozen(np.empty((0, 2)), (0, 2))
 _Array = TypeVar("_Array", FloatArray, IntArray)
 
 
@@ -143,7 +144,7 @@ def verified(
         residual_px=_kept(residual),
         lambda_mm=_kept(seen.crossing.lambda_mm),
         missing_rods=_kept(missing),
-        missing_px=_kept(crossings.xy_mm.take(missing, axis=0) / scale.mm_per_px),
+        missing_px=_kept(crossings.xy_mm.take(missing, axis=0) / scale.mm_per_px) if len(missing) else _NOWHERE,
         rms_px=math.sqrt(float(every_residual @ every_residual) / len(every_residual)),
         chi2=chi2,
         degrees_of_freedom=dof,
@@ -154,7 +155,7 @@ def verified(
     if near_misses_p(scene, scale, best) < NEAR_MISS_P:
         return None
     weakness = _greatest_condition(model, moved)
-    if weakness > TWO_MINIMA_CONDITION:
+    if weakness > TWO_MINIMA_BOUND:
         desired = Desired.of(model, rods, scene.xy_mm[best.spot_index], scene.covariance_mm[best.spot_index])
         if has_other_minimum(model, moved, desired, T_predicted, predicted_covariance):
             return None
@@ -304,18 +305,23 @@ class LeftOut(NamedTuple):
 
     def protection_mm(self, points: FloatArray, moved: ServoResult, risk: float) -> FloatArray:
         """:func:`ctreg_cli.registration.integrity.protection_levels` (p,) at ``points`` (p, 3), in closed form."""
-        k, p = len(self.left), len(points)
+        k, p, sds = len(self.left), len(points), _sd_at_risk(risk, len(self.left))
         G = levers(points.dot(moved.T[:3, :3].T))
         # (p, k, 3, 2)
         moves = G.reshape(3 * p, 6).dot(self.influence).reshape(p, 3, k, 2).transpose(0, 2, 1, 3)
-        variance = np.empty((p, k + 1, 3, 3))
-        variance[:] = (G @ moved.covariance @ G.transpose(0, 2, 1))[:, None]
-        variance[:, :k] += moves @ self.left @ moves.transpose(0, 1, 3, 2)
-        level = np.sqrt(np.array([*map(largest_eigenvalue, variance.reshape(-1, 9).tolist())])).reshape(p, k + 1)
-        level *= _sd_at_risk(risk, k)
-        separation = (moves @ self.pull[:, :, None])[..., 0]
-        level[:, :k] += np.sqrt((separation * separation).sum(axis=-1))
-        return np.asarray(level.max(axis=1))
+        together = (G @ moved.covariance @ G.transpose(0, 2, 1)).reshape(p, 9).tolist()
+        without = (moves @ self.left @ moves.transpose(0, 1, 3, 2)).reshape(p, k, 9).tolist()
+        separations = (moves @ self.pull[:, :, None]).reshape(p, k, 3).tolist()
+        levels = []
+        for variance, more, separation in zip(together, without, separations, strict=True):
+            level = sds * math.sqrt(largest_eigenvalue(variance))
+            for added, apart in zip(more, separation, strict=True):
+                total, off = [*map(add, variance, added)], math.hypot(*apart)
+                # an eigenvalue is at most the trace: few have to be worked out
+                if off + sds * math.sqrt(total[0] + total[4] + total[8]) > level:
+                    level = max(level, off + sds * math.sqrt(largest_eigenvalue(total)))
+            levels.append(level)
+        return np.array(levels)
 
 
 @lru_cache(maxsize=64)
