@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,7 +12,7 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.options import RegistrationOptions
-from ctreg_cli.registration.register import register
+from ctreg_cli.registration.register import register, undetermined
 from ctreg_cli.scale import Scale
 from tests.oracle import OracleFrame, OracleScene, bound, cross_rod, random_frame, twist_error
 from tests.registration.frames import frame_of, model_of, registered, scale_of, some_scene, spots_of
@@ -377,3 +379,22 @@ def test_a_mount_is_not_obeyed_against_the_spots(axis: str) -> None:
             ]
             against += min(turned) < 0.1
     assert against >= 4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_place_known_to_a_quarter_of_the_frame_is_none_wherever_the_frame_file_has_its_origin(seed: int) -> None:
+    """What counts is the frame's centre: far from it, a rotation known well enough makes a place known badly."""
+    rng = np.random.default_rng(seed)
+    far = rng.normal(size=3) * 500.0
+    moved = replace(CUBE, rods=tuple(replace(rod, start=rod.start + far, end=rod.end + far) for rod in CUBE.rods))
+    T = poses.make_pose(Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3) * 50.0)
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    for share, is_unknown in ((0.2, False), (0.3, True)):
+        at_centre = 1e-4 * np.eye(6)
+        at_centre[:3, :3] += (share * CUBE.size_mm) ** 2 * np.outer(direction, direction)
+        for model in (CUBE, moved):
+            arm = T[:3, :3] @ model.centre
+            to_origin = np.eye(6)  # V at the origin is V at the centre less Ω × arm
+            to_origin[:3, 3:] = np.array([[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]])
+            assert undetermined(model, T, to_origin @ at_centre @ to_origin.T) == is_unknown
