@@ -54,6 +54,12 @@ def cross_rod(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray) 
     return (a + share * (b - a))[:2], float(share)
 
 
+def cross_rods(starts: np.ndarray, ends: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The same (k, 2), mm, of those of many rods that are cut, and not next to an end."""
+    hits = [cross_rod(start, end, R, t) for start, end in zip(starts, ends, strict=True)]
+    return np.array([hit[0] for hit in hits if hit is not None and 0.02 < hit[1] < 0.98])
+
+
 def cross_line(start: np.ndarray, end: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The same for the unbounded line."""
     crossing: np.ndarray = cross_lines(start[None], end[None], R, t)[0]

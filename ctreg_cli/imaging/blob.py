@@ -187,7 +187,7 @@ def _with_moments(
     own: BoolArray,
     foreign: BoolArray,
 ) -> Blobs:
-    centre, moments = _moments(own, radius)
+    centre, moments = moments_of(own, radius)
     return Blobs(
         middles=middles,
         radius=radius,
@@ -222,24 +222,14 @@ def axes_of(moments: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return major, minor, 0.5 * np.arctan2(uv, half_difference)
 
 
-def _moments(own: BoolArray, radius: int) -> tuple[FloatArray, FloatArray]:
-    """Centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, n, n), px."""
-    _, centre, moments = moments_of(own.reshape(len(own), -1), monomials(radius))
-    return centre, moments
-
-
-def moments_of(own: BoolArray, monomials: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Areas (k,), centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, p), px.
-
-    ``monomials`` are those of the pixels, (p, 7) rows of :func:`monomials`.
-    """
-    sums = own.astype(np.float64).dot(monomials)
-    area = sums[:, 0].copy()
+def moments_of(own: BoolArray, radius: int) -> tuple[FloatArray, FloatArray]:
+    """Centres of gravity (k, 2) and second moments (k, 2, 2) of regions (k, n, n) of windows, px."""
+    sums = own.reshape(len(own), -1).astype(np.float64).dot(monomials(radius))
     sums /= np.maximum(sums[:, :1], 1.0)
     centre = sums[:, 1:3].copy()
     moments = sums[:, 3:].reshape(-1, 2, 2) - centre[:, :, None] * centre[:, None]
     moments += _PIXEL_VARIANCE * _UNIT
-    return area, centre, moments
+    return centre, moments
 
 
 @cache

@@ -18,6 +18,7 @@ from ctreg_cli.imaging.uncertainty import (
     HIDING_SHARE,
     KEPT,
     KEPT_ABOVE_FLOOR,
+    at_floor,
     centre_covariance,
     even_variance,
     noise_at_floor,
@@ -159,12 +160,12 @@ def structure_near(fitted: Profiles, rough: FloatArray, radius: int) -> FloatArr
     """Variance (k,) of the background structure that disturbs fitted centres, beyond noise of sd ``rough`` (k,)."""
     variance = odd_variance(fitted.residuals, fitted.near, fitted.centre, radius, rough) / KEPT
     values, near, quiet = fitted.rows.values, fitted.near, fitted.quiet
-    at_floor = values <= np.where(quiet, values, np.inf).min(axis=1, keepdims=True)
-    hides = np.count_nonzero(at_floor & near, axis=1) > HIDING_SHARE * np.count_nonzero(near, axis=1)
+    low = at_floor(values, quiet)
+    hides = np.count_nonzero(low & near, axis=1) > HIDING_SHARE * np.count_nonzero(near, axis=1)
     if hides.any():
         root_weights = fitted.rows.root_weights
         in_fit = root_weights > LEAST_SHARE_OF_WEIGHT * root_weights.max(axis=1, keepdims=True)
-        shown = (near | ~quiet) & ~at_floor & (values < fitted.ceiling) & in_fit
+        shown = (near | ~quiet) & ~low & (values < fitted.ceiling) & in_fit
         above = odd_variance_above_floor(fitted.residuals, shown, fitted.centre, radius, rough) / KEPT_ABOVE_FLOOR
         variance = np.where(hides, np.maximum(variance, above), variance)
     return variance

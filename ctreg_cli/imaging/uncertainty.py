@@ -109,6 +109,11 @@ def noise_field(residuals: FloatArray, quiet: BoolArray, radius: int) -> tuple[F
     return fine, fine / np.interp(length, NOISE_LENGTHS_PX, fine_gain), length
 
 
+def at_floor(values: FloatArray, quiet: BoolArray) -> BoolArray:
+    """Which pixels (k, p) hold no more than the least of what is ``quiet`` (k, p) about them: the floor, perhaps."""
+    return np.asarray(values <= np.where(quiet, values, np.inf).min(axis=1, keepdims=True))
+
+
 def noise_at_floor(residuals: FloatArray, values: FloatArray, quiet: BoolArray, height: FloatArray) -> FloatArray:
     """Sd (k,) of the noise of spots whose surroundings are cut off below; 0 where they are not.
 
@@ -121,11 +126,11 @@ def noise_at_floor(residuals: FloatArray, values: FloatArray, quiet: BoolArray, 
         quiet: (k, p), where noise would be looked for.
         height: (k,) of the spots.
     """
-    at_floor = (values <= np.where(quiet, values, np.inf).min(axis=1, keepdims=True)) & quiet
-    cut = np.count_nonzero(at_floor, axis=1) > FLOOR_SHARE * np.count_nonzero(quiet, axis=1)
+    low = at_floor(values, quiet)
+    cut = np.count_nonzero(low & quiet, axis=1) > FLOOR_SHARE * np.count_nonzero(quiet, axis=1)
     result = np.zeros(len(values))
     for k in np.flatnonzero(cut):
-        above = residuals[k, values[k] > values[k, at_floor[k]][0]]
+        above = residuals[k, ~low[k]]
         free = len(above) - FITTED
         seen = FLOOR_SHARED * float(np.sqrt((above**2).sum() / free)) if free > 0 else np.inf
         result[k] = min(seen, MOST_AT_FLOOR * height[k])

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache, wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
 
 from pydicom.datadict import dictionary_description, tag_for_keyword
 from pydicom.filereader import data_element_generator
@@ -267,7 +267,8 @@ def once_a_series(
 _IS_TEXT = {keyword: keyword in ("InstanceNumber", "NumberOfFrames") for keyword in _TAG}
 
 
-class PixelElement(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelElement:
     """Where the pixels of a file begin."""
 
     keyword: str
@@ -278,7 +279,8 @@ class PixelElement(NamedTuple):
     offset: int
 
 
-class Header(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
     """What stands before the pixels of one file."""
 
     elements: Elements

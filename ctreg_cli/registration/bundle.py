@@ -22,7 +22,7 @@ from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.registration.adjustment import BOW_SHARE, Adjustment, ScanSpots, adjust
 from ctreg_cli.registration.joint import register_joint, scan_spots
 from ctreg_cli.registration.options import RegistrationOptions
-from ctreg_cli.registration.refine import across
+from ctreg_cli.registration.refine import across, model_without_tolerance
 from ctreg_cli.registration.register import register
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
@@ -164,8 +164,7 @@ def _refinement(model: RodModel, scan: ScanSpots, found: Adjustment, *, free_sca
         )
         for rod, d, left in zip(model.rods, shift, remaining, strict=True)
     )
-    as_written = replace(model, rods=tuple(replace(rod, tolerance_mm=0.0) for rod in model.rods))
-    before = adjust(as_written, found.T_patient_model, scan.matching(found.matched), reject=False)
+    before = adjust(model_without_tolerance(model), found.T_patient_model, scan.matching(found.matched), reject=False)
     factor = np.exp(found.log_scale)
     return RodRefinement(
         model=replace(model, rods=rods),

@@ -26,7 +26,13 @@ from ctreg_cli.registration.matching import (
     roots_of_triples,
     weigh,
 )
-from ctreg_cli.registration.refine import Linearisation, linearise, refine
+from ctreg_cli.registration.refine import (
+    Linearisation,
+    covariance_from_information,
+    linearise,
+    principal_axes,
+    refine,
+)
 from ctreg_cli.rods import RodModel
 
 #: matches within this many nats of the best are taken apart
@@ -125,9 +131,9 @@ def _restart(model: RodModel, scene: Scene, matches: Matches, row: int, least_ma
 
 def _along_the_weakest(model: RodModel, T: FloatArray, fit: Linearisation) -> FloatArray:
     """(s, 4, 4) poses away from ``T`` (4, 4) to both sides, along the direction that its spots say least about."""
-    unit = np.array([1, 1, 1, *(3 * [1 / model.size_mm])])
-    _, vectors = np.linalg.eigh(fit.normal_equations()[0][0] * (unit[:, None] * unit))
-    return poses.update(np.repeat(T[None], len(_AWAY), axis=0), _AWAY[:, None] * model.size_mm * unit * vectors[:, 0])
+    C, _ = covariance_from_information(fit.normal_equations()[0][0], model.size_mm)
+    weakest = principal_axes(C, model.size_mm)[1][:, -1]
+    return poses.update(np.repeat(T[None], len(_AWAY), axis=0), _AWAY[:, None] * model.size_mm * weakest)
 
 
 def _vary(model: RodModel, scene: Scene, matches: Matches, row: int, least_matches: int) -> Matches | None:

@@ -17,7 +17,13 @@ from ctreg_cli.arrays import BoolArray, FloatArray
 from ctreg_cli.geometry import pose as poses
 from ctreg_cli.geometry.plucker import skew
 from ctreg_cli.registration.evidence import PosePrior
-from ctreg_cli.registration.refine import Linearisation, Observations, covariance_from_information, linearise
+from ctreg_cli.registration.refine import (
+    Linearisation,
+    Observations,
+    covariance_from_information,
+    linearise,
+    principal_axes,
+)
 from ctreg_cli.rods import RodModel
 
 #: χ² that three sd must cost (a straight cost: 9) for the covariance to be believed as it is
@@ -82,9 +88,7 @@ def covariance_along_the_valley(
         is known: the profile stays flat for too long, or the truth may well lie where the spots say so much more that
         this pose would be wrong by six of the standard deviations there.
     """
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
-    values, vectors = np.linalg.eigh(covariance / inflation**2 * (unit[:, None] * unit))
-    axes = vectors / unit[:, None]
+    values, axes = principal_axes(covariance / inflation**2, model.size_mm)
     sd = math.sqrt(max(float(values[-1]), 0.0))
 
     inward = np.linspace(3, 0, _POINTS, endpoint=False)

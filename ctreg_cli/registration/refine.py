@@ -342,6 +342,16 @@ def covariance_from_information(H: FloatArray, size_mm: float) -> tuple[FloatArr
     return scaled * (unit[:, None] * unit), np.where(singular.any(axis=-1), np.inf, condition)
 
 
+def principal_axes(covariance: FloatArray, size_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Variances (6,), rising, and twists (6, 6), one a column, of a pose covariance (6, 6); rotation in frame sizes.
+
+    A twist has the length of 1 mm, and the variances are mm².
+    """
+    unit = np.array([1, 1, 1, *(3 * [size_mm])])
+    values, vectors = np.linalg.eigh(covariance * (unit[:, None] * unit))
+    return values, vectors / unit[:, None]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScaleFit:
     """Shared pixel scales and one pose a slice."""

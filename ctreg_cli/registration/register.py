@@ -27,6 +27,7 @@ from ctreg_cli.registration.refine import (
     Linearisation,
     Observations,
     covariance_from_information,
+    principal_axes,
     refine,
 )
 from ctreg_cli.registration.result import Candidate, Registration
@@ -640,14 +641,13 @@ def pose_distance_sd(a: Candidate, b: Candidate) -> float:
 
 def weakness(model: RodModel, covariance: FloatArray) -> str:
     """The worst-known direction of a pose in plain words, or nothing where all are known alike."""
-    unit = np.array([1, 1, 1, *(3 * [model.size_mm])])
     # about the frame's own centre nothing is blamed on a far-away model origin; slice axes
-    values, vectors = np.linalg.eigh(covariance * (unit[:, None] * unit))
+    values, axes = principal_axes(covariance, model.size_mm)
     if values[-1] <= WEAK_CONDITION**2 * max(float(values[0]), 1e-300):
         return ""
-    worst = vectors[:, -1] / unit
+    worst = axes[:, -1]
     sd = math.sqrt(float(values[-1]))
-    turn = np.linalg.norm(vectors[3:, -1]) > np.linalg.norm(vectors[:3, -1])
+    turn = model.size_mm * np.linalg.norm(worst[3:]) > np.linalg.norm(worst[:3])
     axis = "xyz"[int(np.abs(worst[3:] if turn else worst[:3]).argmax())]
     if turn:
         angle = math.degrees(sd * float(np.linalg.norm(worst[3:])))

@@ -13,10 +13,11 @@ import math
 import numpy as np
 
 from ctreg_cli.arrays import FloatArray
+from ctreg_cli.registration.refine import principal_axes
 from ctreg_cli.rods import RodModel
 from ctreg_cli.tracking.gate import GATE_SD
-from ctreg_cli.tracking.servo import Desired, ServoOptions, ServoResult, servo, view
-from ctreg_cli.tracking.single import difference, solve_positive, updated
+from ctreg_cli.tracking.servo import ControlLaw, Desired, ServoOptions, ServoResult, servo, view
+from ctreg_cli.tracking.single import difference, updated
 
 #: a frame that is known so much worse in one direction than in another may have two minima along it: by a bound that
 #: costs next to nothing, and by its eigenvalues. In 15,000 random poses of all kinds of frames 179 had a second minimum
@@ -43,11 +44,10 @@ def has_other_minimum(
         T_predicted: (4, 4) where the past expected the frame.
         predicted_covariance: (6, 6) of it.
     """
-    unit = np.array([1.0, 1.0, 1.0, *(3 * [model.size_mm])])
-    values, vectors = np.linalg.eigh(moved.covariance * (unit[:, None] * unit))
+    values, axes = principal_axes(moved.covariance, model.size_mm)
     if values[-1] < _TWO_MINIMA_CONDITION**2 * values[0]:
         return False
-    along, sd = vectors[:, -1] / unit, math.sqrt(float(values[-1]))
+    along, sd = axes[:, -1], math.sqrt(float(values[-1]))
     by_past = np.linalg.solve(predicted_covariance, along)
     middle = float(difference(T_predicted, moved.T) @ by_past) / float(along @ by_past)
     reach = GATE_SD / math.sqrt(float(along @ by_past))
@@ -74,10 +74,10 @@ def has_other_minimum(
 def _leads_back(moved: ServoResult, desired: Desired, away: FloatArray) -> bool:
     """Whether a single step from ``away`` (6,) leads nearly all the way back: up to there the cost is a bowl."""
     there = view(desired, updated(moved.T, away))
-    WJ = there.weighted(there.jacobian)
     try:
-        left = away + solve_positive(WJ.T.dot(there.jacobian), there.residual_px.reshape(-1).dot(WJ))
+        step, _ = ControlLaw.of(there).full_step(there)
     except np.linalg.LinAlgError:
         return False
+    left = away + step
     way2 = float(away.dot(moved.information).dot(away))
     return float(left.dot(moved.information).dot(left)) < _LEFT_OF_WAY**2 * way2

@@ -241,7 +241,7 @@ def servo(
     options = options or ServoOptions()
     size_mm = model.size_mm
     here = view(desired, T, crossing)
-    law = _Law.of(here, jacobian)
+    law = ControlLaw.of(here, jacobian)
     path = [(T, here, law.margin(here, size_mm))] if keep_path else []
     iterations, before_sd = 0, 0.0
     looks_no_more = jacobian is None and options.gain == 1.0 and not keep_path
@@ -268,7 +268,7 @@ def servo(
         T = updated(T, step)
         here = view(desired, T)
         if jacobian is None:
-            law = _Law.of(here, None)
+            law = ControlLaw.of(here)
         if keep_path:
             path.append((T, here, law.margin(here, size_mm)))
     return ServoResult(
@@ -286,7 +286,7 @@ def servo(
     )
 
 
-class _Law(NamedTuple):
+class ControlLaw(NamedTuple):
     """``ξ = Ĵ⁺ (s* − s)`` with one Ĵ."""
 
     #: (2k, 6) ``W Ĵ``, and (6, 6) ``Ĵᵀ W Ĵ`` and its inverse
@@ -297,16 +297,13 @@ class _Law(NamedTuple):
     J_plus: FloatArray | None
 
     @classmethod
-    def of(cls, here: View, jacobian: FloatArray | None) -> _Law:
+    def of(cls, here: View, jacobian: FloatArray | None = None) -> ControlLaw:
         J = here.jacobian if jacobian is None else jacobian
         WJ = here.weighted(J)
         information = WJ.T.dot(J)
-        return cls(
-            weighted=WJ,
-            information=information,
-            inverse=inverse_positive(information),
-            J_plus=None if jacobian is None else solve_positive(information, WJ.T),
-        )
+        inverse = inverse_positive(information)
+        J_plus = None if jacobian is None else inverse.dot(WJ.T)
+        return cls(weighted=WJ, information=information, inverse=inverse, J_plus=J_plus)
 
     def full_step(self, here: View) -> tuple[FloatArray, float]:
         """The twist (6,) of gain one, and how far it would move the spots: Σ ‖Δs‖² in sd, to first order."""

@@ -72,7 +72,7 @@ def test_one_ellipse_is_that_of_many(seed: int) -> None:
     rng = np.random.default_rng(seed)
     terms, shares = monomials(5), np.array([0.0, 0.01, 0.3, 0.9, 1.0])
     own = rng.random((5, len(terms))) < shares[:, None]
-    _, middle, moments = moments_of(own, terms)
+    middle, moments = moments_of(own.reshape(-1, 11, 11), 5)
     expected = np.array([*middle.T, *inverse_elements(4.0 * moments), *axes_of(moments)])
     one_by_one = np.transpose([ellipse(*sums) for sums in (own.astype(float) @ terms).tolist()])
     np.testing.assert_allclose(one_by_one, expected, rtol=1e-9, atol=1e-9)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +14,12 @@ from ctreg_cli.geometry import pose as poses
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
 from ctreg_cli.registration.linearity import MOST_WRONG_P, Valley
+from ctreg_cli.registration.refine import model_without_tolerance
 from ctreg_cli.registration.register import RIVAL_LOG_ODDS, accepted_log_odds, doubts_and_rivals, register, untold_p
 from ctreg_cli.registration.result import Candidate
 from ctreg_cli.registration.twins import Twin
 from ctreg_cli.scale import Scale
-from tests.oracle import cross_rod, twist_error
+from tests.oracle import cross_rods, twist_error
 
 
 def candidate(
@@ -117,13 +117,11 @@ def test_more_is_asked_among_more_clutter_and_of_four_matches(matches: int) -> N
 def test_rods_hidden_together_do_not_decide_between_two_poses_of_four_spots(seed: int) -> None:
     """Two panels, two rods hidden: one of the poses has these beyond their ends, and seems to miss none."""
     rng = np.random.default_rng(seed)
-    model = load_rod_model("leksell-g-2-panel")
-    model = replace(model, rods=tuple(replace(rod, tolerance_mm=0.0) for rod in model.rods))
+    model = model_without_tolerance(load_rod_model("leksell-g-2-panel"))
     assert model.mount is not None
     R = Rotation.from_rotvec(rng.normal(size=3) * 0.15).as_matrix() @ np.asarray(model.mount.patient_from_model)
     t = np.array([200, 200, rng.uniform(-40, 40)]) - R @ model.centre
-    hits = [cross_rod(start, end, R, t) for start, end in zip(model.starts, model.ends, strict=True)]
-    uv = np.array([hit[0] for hit in hits if hit is not None and 0.02 < hit[1] < 0.98]) / 0.8
+    uv = cross_rods(model.starts, model.ends, R, t) / 0.8
     uv = uv[np.sort(rng.choice(len(uv), 4, replace=False))]
     uv += rng.normal(size=uv.shape) * 0.02
     result = register(Spots.from_points(uv, 0.02), model, scale=Scale(s_x=0.8, s_y=0.8))

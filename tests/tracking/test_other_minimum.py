@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,18 +11,13 @@ from ctreg_cli.imaging.slice import SliceInfo
 from ctreg_cli.imaging.spot_slice import SpotSlice
 from ctreg_cli.imaging.spots import Spots
 from ctreg_cli.io.rod_file import load_rod_model
+from ctreg_cli.registration.refine import model_without_tolerance
 from ctreg_cli.rods import RodModel
 from ctreg_cli.scale import Scale
-from tests.oracle import cross_rod
+from tests.oracle import cross_rods
 from tests.tracking.sequences import TrueSlice, is_wrong
 
 MM_PER_PX, SD_PX = 0.8, 0.05
-
-
-def two_panels() -> RodModel:
-    """With rods that are as they are drawn."""
-    model = load_rod_model("leksell-g-2-panel")
-    return replace(model, rods=tuple(replace(rod, tolerance_mm=0.0) for rod in model.rods))
 
 
 def swaying(seed: int, model: RodModel, n: int = 60) -> tuple[list[SpotSlice], list[TrueSlice]]:
@@ -45,8 +38,7 @@ def swaying(seed: int, model: RodModel, n: int = 60) -> tuple[list[SpotSlice], l
         wave = np.sin(2 * np.pi * time_s / period_s + phase)
         R = Rotation.from_rotvec(tilt + turn * wave[:3]).as_matrix() @ np.asarray(model.mount.patient_from_model)
         t = np.array([200, 200, height]) + amplitude * wave[3:] - R @ model.centre
-        hits = [cross_rod(start, end, R, t) for start, end in zip(model.starts, model.ends, strict=True)]
-        uv = np.array([hit[0] for hit in hits if hit is not None and 0.02 < hit[1] < 0.98]) / MM_PER_PX
+        uv = cross_rods(model.starts, model.ends, R, t) / MM_PER_PX
         uv += rng.normal(size=uv.shape) * SD_PX
         spots = Spots(uv_px=uv, covariance_px=np.tile(np.eye(2) * SD_PX**2, (len(uv), 1, 1)))
         slices.append(SpotSlice(info=SliceInfo(source="", time_s=float(time_s), scale=scale), spots=spots))
@@ -56,7 +48,7 @@ def swaying(seed: int, model: RodModel, n: int = 60) -> tuple[list[SpotSlice], l
 
 @pytest.mark.parametrize("seed", [1, 7, 11, 12])
 def test_the_past_does_not_settle_which_of_two_poses_near_each_other(seed: int) -> None:
-    model = two_panels()
+    model = model_without_tolerance(load_rod_model("leksell-g-2-panel"))
     slices, truth = swaying(seed, model)
     results = list(pipeline.track(slices, model))
     sure = [(result.candidates[0], true) for result, true in zip(results, truth, strict=True) if result.status == "ok"]
